@@ -1,0 +1,1 @@
+"""Stable-Baselines3 plugin: Symphony, REDQ and DroQ."""
