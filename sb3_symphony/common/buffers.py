@@ -1,0 +1,516 @@
+"""
+Replay buffers that do not draw uniformly: fading (recent transitions more often) and prioritised (large errors more often).
+
+All of them keep Stable-Baselines3's storage, whose arrays are ``(rows, n_envs, ...)`` with ``pos`` the next row to write,
+and change only which transitions are drawn. All draws come from numpy's global generator, the one SB3 seeds.
+"""
+
+import copy
+import math
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Fading: weights and exact draws
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _check_fading(fade_factor: float | None, fade_power: float) -> None:
+    if fade_factor is not None and not fade_factor > 0:  # written so that NaN is refused too
+        raise ValueError(f"fade_factor={fade_factor!r}: expected a number > 0, or None (or inf) for uniform sampling")
+    if not (fade_power > 0 and math.isfinite(fade_power)):
+        raise ValueError(f"fade_power={fade_power!r}: expected a finite number > 0")
+
+
+def _is_uniform(fade_factor: float | None) -> bool:
+    return fade_factor is None or math.isinf(fade_factor)
+
+
+def fade_weights(size: int, fade_factor: float | None = 7.0, fade_power: float = 2.0) -> np.ndarray:
+    """
+    Probability of every stored transition under fading replay, by the direct formula p_i ∝ tanh(f·(i/n)^power).
+
+    The oldest transition (i = 0) has probability exactly 0, the newest (i = n - 1) the largest one. If every weight
+    vanishes (n = 1), the probabilities are uniform. Meant for tests and plots: sampling never builds this array.
+
+    Source: Read, "Dancing like the Inbetweeners: learning to walk with Symphony" (2024), where the power is 2.
+
+    :param size: number n of stored transitions, at least 1
+    :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
+    :param fade_power: power of the normalised age index, > 0
+    :return: float64 array ``(size,)``, oldest first, that sums to 1
+    :raises ValueError: for a size < 1, a fade factor <= 0 or NaN, or a power that is not finite and > 0
+    """
+    _check_fading(fade_factor, fade_power)
+    if size < 1:
+        raise ValueError(f"size={size!r}: expected at least 1 transition")
+    if fade_factor is None or _is_uniform(fade_factor):
+        return np.full(size, 1.0 / size)
+    weights = np.tanh(fade_factor * (np.arange(size) / size) ** fade_power)
+    total = weights.sum()
+    return weights / total if total > 0 else np.full(size, 1.0 / size)
+
+
+@lru_cache(maxsize=64)
+def _acceptance_rate(fade_factor: float, fade_power: float) -> float:
+    """Share of draws accepted below for n → ∞: the mean of tanh(f·x^power) over [0, 1], relative to its maximum."""
+    x = (np.arange(4096) + 0.5) / 4096
+    return float(np.mean(np.tanh(fade_factor * x**fade_power)) / np.tanh(fade_factor))
+
+
+def draw_faded_ages(size: int, n_draws: int, fade_factor: float, fade_power: float = 2.0) -> np.ndarray:
+    """
+    Draw age indices (0 = oldest) with exactly the probabilities of :func:`fade_weights`, with replacement.
+
+    Rejection: an index drawn uniformly is accepted with probability (its weight / the newest one's weight), so the
+    cost of a draw does not depend on the number of stored transitions (1.4 trials per draw for f = 7).
+
+    :param size: number n of stored transitions, at least 1
+    :param n_draws: number of indices to draw
+    :param fade_factor: steepness f > 0, finite
+    :param fade_power: power of the normalised age index, > 0
+    :return: int array ``(n_draws,)`` of values in [0, size)
+    """
+    newest = np.tanh(fade_factor * ((size - 1) / size) ** fade_power)
+    if newest == 0:  # all weights vanish
+        return np.random.randint(0, size, size=n_draws)
+    rate = _acceptance_rate(fade_factor, fade_power)
+    ages = np.empty(n_draws, dtype=np.int64)
+    filled = 0
+    while filled < n_draws:
+        # A few per cent more trials than needed on average, so that one pass mostly suffices
+        trials = int(1.05 * (n_draws - filled) / rate) + 16
+        candidates = np.random.randint(0, size, size=trials)
+        weights = np.tanh(fade_factor * (candidates / size) ** fade_power)
+        # Strictly less: weight 0 is never accepted
+        accepted = candidates[np.random.random(trials) * newest < weights][: n_draws - filled]
+        ages[filled : filled + len(accepted)] = accepted
+        filled += len(accepted)
+    return ages
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Storage shared by the buffers below
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _refuse_memory_optimisation(name: str, optimize_memory_usage: bool) -> None:
+    if optimize_memory_usage:
+        raise ValueError(
+            f"{name} does not support optimize_memory_usage=True: it stores next observations apart, because time limits "
+            "must not end bootstrapping"
+        )
+
+
+class _StepsReplayBuffer(NStepReplayBuffer):
+    """SB3's n-step buffer, except that one step gives exactly the samples of SB3's plain buffer (no discounts)."""
+
+    def __init__(self, *args: Any, n_steps: int = 1, gamma: float = 0.99, **kwargs: Any) -> None:
+        if isinstance(n_steps, bool) or not isinstance(n_steps, int | np.integer) or n_steps < 1:
+            raise ValueError(f"n_steps={n_steps!r}: expected an integer >= 1")
+        if not 0 <= gamma <= 1:
+            raise ValueError(f"gamma={gamma!r}: expected a number in [0, 1]")
+        super().__init__(*args, n_steps=n_steps, gamma=gamma, **kwargs)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        if self.n_steps == 1:
+            return ReplayBuffer._get_samples(self, batch_inds, env=env)
+        return super()._get_samples(batch_inds, env=env)
+
+
+class _FadedSampling(ReplayBuffer):
+    """The rows drawn by both fading buffers; what a row holds is the business of the other base class."""
+
+    def __init__(self, *args: Any, fade_factor: float | None = 7.0, fade_power: float = 2.0, **kwargs: Any) -> None:
+        _check_fading(fade_factor, fade_power)
+        super().__init__(*args, **kwargs)
+        self.fade_factor = fade_factor
+        self.fade_power = fade_power
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None, uniform: bool = False) -> Any:
+        """
+        Draw transitions with replacement; the environment of a row is drawn uniformly.
+
+        :param batch_size: number of transitions to draw; may exceed the number stored
+        :param env: ``VecNormalize`` whose current statistics normalise observations and rewards
+        :param uniform: draw uniformly for this one call
+        :return: SB3's samples, tensors of shape ``(batch_size, ...)``
+        :raises ValueError: if the buffer is empty
+        """
+        n_rows = self.size()
+        if n_rows == 0:
+            raise ValueError(f"{type(self).__name__}: cannot sample, no transition is stored yet")
+        if uniform or self.fade_factor is None or _is_uniform(self.fade_factor):
+            return super().sample(batch_size, env=env)
+        rows = draw_faded_ages(n_rows, batch_size, self.fade_factor, self.fade_power)
+        if self.full:  # the oldest row is the next one to be overwritten
+            rows = (rows + self.pos) % self.buffer_size
+        return self._get_samples(rows, env=env)
+
+    def to_torch(self, array: np.ndarray, copy: bool = False) -> th.Tensor:
+        # Samples are fancy-indexed, hence fresh arrays already: a second copy would protect nothing
+        return super().to_torch(array, copy=copy)
+
+
+class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
+    """
+    Replay buffer that draws recent transitions more often: weight ∝ tanh(f·x^power), x = i/n with i = 0 the oldest.
+
+    At the defaults the newest transition is drawn 1.40 times as often as under uniform replay, the older half holds
+    30 % of the mass, the oldest transition is never drawn. Draws are exact, cost the same for every buffer size, and
+    follow age (not position) once the ring has wrapped. Works under SB3's own off-policy algorithms too::
+
+        TD3("MlpPolicy", env, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=dict(fade_factor=7.0))
+
+    Under SB3's algorithms, n-step returns need ``n_steps`` *and* ``gamma`` in ``replay_buffer_kwargs``.
+
+    Source: Read, "Dancing like the Inbetweeners: learning to walk with Symphony" (2024).
+
+    :param buffer_size: number of transitions to keep, over all environments
+    :param observation_space: observation space (not Dict: see :class:`FadingDictReplayBuffer`)
+    :param action_space: action space
+    :param device: PyTorch device of the samples
+    :param n_envs: number of parallel environments
+    :param optimize_memory_usage: not supported, must be ``False``
+    :param handle_timeout_termination: bootstrap through time limits
+    :param n_steps: horizon of the returns; 1 gives SB3's plain samples, more adds ``discounts`` to them
+    :param gamma: discount factor of the n-step returns (unused if ``n_steps`` is 1)
+    :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
+    :param fade_power: power of the normalised age index, > 0
+    :raises ValueError: for a value outside the ranges above, Dict observations, or ``optimize_memory_usage=True``
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        fade_factor: float | None = 7.0,
+        fade_power: float = 2.0,
+    ) -> None:
+        _refuse_memory_optimisation("FadingReplayBuffer", optimize_memory_usage)
+        if isinstance(observation_space, spaces.Dict):
+            raise ValueError("FadingReplayBuffer does not hold Dict observations: use FadingDictReplayBuffer")
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device=device,
+            n_envs=n_envs,
+            handle_timeout_termination=handle_timeout_termination,
+            n_steps=n_steps,
+            gamma=gamma,
+            fade_factor=fade_factor,
+            fade_power=fade_power,
+        )
+
+
+class FadingDictReplayBuffer(_FadedSampling, DictReplayBuffer):
+    """
+    :class:`FadingReplayBuffer` for Dict observations, without n-step returns (as in SB3).
+
+    :param buffer_size: number of transitions to keep, over all environments
+    :param observation_space: Dict observation space
+    :param action_space: action space
+    :param device: PyTorch device of the samples
+    :param n_envs: number of parallel environments
+    :param optimize_memory_usage: not supported, must be ``False``
+    :param handle_timeout_termination: bootstrap through time limits
+    :param n_steps: must be 1
+    :param gamma: unused, accepted so that both fading buffers take the same arguments
+    :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
+    :param fade_power: power of the normalised age index, > 0
+    :raises ValueError: for a value outside the ranges above, or ``optimize_memory_usage=True``
+    """
+
+    # SB3 declares one array on the parent and a dictionary on the Dict buffer
+    observations: dict[str, np.ndarray]  # type: ignore[assignment]
+    next_observations: dict[str, np.ndarray]  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Dict,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        fade_factor: float | None = 7.0,
+        fade_power: float = 2.0,
+    ) -> None:
+        _refuse_memory_optimisation("FadingDictReplayBuffer", optimize_memory_usage)
+        if n_steps != 1:
+            raise ValueError(f"n_steps={n_steps!r}: expected 1, n-step returns are not supported for Dict observations")
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device=device,
+            n_envs=n_envs,
+            handle_timeout_termination=handle_timeout_termination,
+            fade_factor=fade_factor,
+            fade_power=fade_power,
+        )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Prioritised replay
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+class SumTree:
+    """
+    Non-negative values with their sum and draws proportional to them, in O(log n), vectorised over a batch.
+
+    One float64 array: node k has children 2k and 2k + 1, node 1 is the total, the leaves are the last half. Parents are
+    recomputed from their children (never adjusted by a difference), so rounding errors do not build up.
+
+    :param n_leaves: number of values, at least 1; all start at 0
+    """
+
+    def __init__(self, n_leaves: int) -> None:
+        self.n_leaves = n_leaves
+        self.first_leaf = 1 << max(n_leaves - 1, 0).bit_length()  # a power of two, so all leaves have the same depth
+        self.nodes = np.zeros(2 * self.first_leaf)
+
+    @property
+    def total(self) -> float:
+        """Sum of all values."""
+        return float(self.nodes[1])
+
+    def get(self, leaves: np.ndarray) -> np.ndarray:
+        """
+        :param leaves: int array of positions in [0, n_leaves)
+        :return: their values
+        """
+        return self.nodes[self.first_leaf + leaves]
+
+    def set(self, leaves: np.ndarray, values: np.ndarray | float) -> None:
+        """
+        :param leaves: int array of positions; of a position given twice, the last value counts
+        :param values: non-negative values, of the same shape or one number
+        """
+        nodes = self.first_leaf + leaves
+        self.nodes[nodes] = values
+        while nodes[0] > 1:  # all nodes are on the same level
+            nodes = nodes >> 1
+            self.nodes[nodes] = self.nodes[2 * nodes] + self.nodes[2 * nodes + 1]
+
+    def find(self, masses: np.ndarray) -> np.ndarray:
+        """
+        :param masses: numbers in [0, total), shape ``(batch,)``
+        :return: for each, the position whose interval of the cumulative sum holds it; never one of value 0
+        """
+        masses = np.array(masses, dtype=np.float64)
+        nodes = np.ones(len(masses), dtype=np.int64)
+        for _ in range(self.first_leaf.bit_length() - 1):
+            nodes *= 2
+            left = self.nodes[nodes]
+            # Rounding may leave a mass just beyond the last non-zero value: never step into an empty subtree
+            go_right = (masses >= left) & (self.nodes[nodes + 1] > 0)
+            masses -= np.where(go_right, left, 0.0)
+            nodes += go_right
+        return nodes - self.first_leaf
+
+
+class PrioritizedReplayBufferSamples(NamedTuple):
+    """
+    SB3's six fields first, then what prioritised replay needs. Tensors, except ``indices``.
+
+    ``weights`` has shape ``(batch, 1)``: multiply each transition's squared error by it. ``indices`` has shape
+    ``(batch,)``: hand it back to :meth:`PrioritizedReplayBuffer.update_priorities`.
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor | None
+    weights: th.Tensor
+    indices: np.ndarray
+
+
+class PrioritizedReplayBuffer(_StepsReplayBuffer):
+    """
+    Proportional prioritised replay: P(i) ∝ (|δ_i| + eps)^alpha, corrected by importance weights (n·P)^-beta / max.
+
+    One priority per transition, that is per row and environment; a new transition gets the largest priority seen so far.
+    Draws are independent (not stratified): only then are the counts in a batch multinomial with exactly P, which is
+    what the tests check; stratifying would lower their variance but make the draws of a batch dependent.
+    The maximum that normalises the weights is the one over the drawn batch.
+
+    Whoever samples must apply ``weights`` and call :meth:`update_priorities`. SB3's own algorithms do neither, so they
+    must not use this buffer: after ten calls of :meth:`sample` without any update, a ``RuntimeError`` says so.
+
+    Source: Schaul et al., "Prioritized Experience Replay" (2016), https://arxiv.org/abs/1511.05952.
+
+    :param buffer_size: number of transitions to keep, over all environments
+    :param observation_space: observation space (not Dict)
+    :param action_space: action space
+    :param device: PyTorch device of the samples
+    :param n_envs: number of parallel environments
+    :param optimize_memory_usage: not supported, must be ``False``
+    :param handle_timeout_termination: bootstrap through time limits
+    :param n_steps: horizon of the returns; more than 1 adds ``discounts`` to the samples
+    :param gamma: discount factor of the n-step returns (unused if ``n_steps`` is 1)
+    :param alpha: exponent of the priorities, >= 0; 0 means uniform
+    :param beta: exponent of the importance weights, >= 0; 1 corrects fully. An attribute: may be changed while training
+    :param eps: added to each error's size, > 0, so that every transition can be drawn
+    :raises ValueError: for a value outside the ranges above, Dict observations, or ``optimize_memory_usage=True``
+    """
+
+    max_samples_without_update = 10
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+        eps: float = 1e-6,
+    ) -> None:
+        _refuse_memory_optimisation("PrioritizedReplayBuffer", optimize_memory_usage)
+        if isinstance(observation_space, spaces.Dict):
+            raise ValueError("PrioritizedReplayBuffer does not hold Dict observations: use FadingDictReplayBuffer")
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not (value >= 0 and math.isfinite(value)):
+                raise ValueError(f"{name}={value!r}: expected a finite number >= 0")
+        if not (eps > 0 and math.isfinite(eps)):
+            raise ValueError(f"eps={eps!r}: expected a finite number > 0")
+        super().__init__(
+            buffer_size,
+            observation_space,
+            action_space,
+            device=device,
+            n_envs=n_envs,
+            handle_timeout_termination=handle_timeout_termination,
+            n_steps=n_steps,
+            gamma=gamma,
+        )
+        self.alpha = alpha
+        self.beta = beta
+        self.eps = eps
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all transitions and priorities."""
+        super().reset()
+        self.tree = SumTree(self.buffer_size * self.n_envs)  # leaf = row * n_envs + environment
+        self.max_priority = 1.0  # before the exponent alpha
+        self._samples_without_update = 0
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition per environment, with the largest priority seen so far.
+
+        :param obs: observations ``(n_envs, ...)``
+        :param next_obs: next observations, the terminal ones where an episode ended
+        :param action: scaled actions ``(n_envs, action_dim)``
+        :param reward: rewards ``(n_envs,)``
+        :param done: ends of episodes ``(n_envs,)``
+        :param infos: one dictionary per environment
+        """
+        leaves = self.pos * self.n_envs + np.arange(self.n_envs)
+        super().add(obs, next_obs, action, reward, done, infos)
+        self.tree.set(leaves, self.max_priority**self.alpha)
+
+    def sample(  # type: ignore[override]
+        self, batch_size: int, env: VecNormalize | None = None
+    ) -> PrioritizedReplayBufferSamples:
+        """
+        Draw transitions with replacement, in proportion to their priorities.
+
+        :param batch_size: number of transitions to draw
+        :param env: ``VecNormalize`` whose current statistics normalise observations and rewards
+        :return: SB3's fields, importance weights ``(batch_size, 1)`` and the positions ``(batch_size,)`` of the priorities
+        :raises ValueError: if the buffer is empty
+        :raises RuntimeError: if priorities are never updated, as under SB3's own algorithms
+        """
+        if self.size() == 0:
+            raise ValueError("PrioritizedReplayBuffer: cannot sample, no transition is stored yet")
+        self._samples_without_update += 1
+        if self._samples_without_update > self.max_samples_without_update:
+            raise RuntimeError(
+                f"PrioritizedReplayBuffer.sample was called {self.max_samples_without_update} times without any "
+                "update_priorities: this algorithm does not support prioritised replay (SB3's own algorithms do not)"
+            )
+        total = self.tree.total
+        leaves = self.tree.find(np.random.random(batch_size) * total)
+        probabilities = self.tree.get(leaves) / total
+        weights = (self.size() * self.n_envs * probabilities) ** -self.beta
+        weights = (weights / weights.max()).astype(np.float32).reshape(-1, 1)
+        samples = self._gather(leaves // self.n_envs, leaves % self.n_envs, env)
+        return PrioritizedReplayBufferSamples(*samples, weights=self.to_torch(weights), indices=leaves)
+
+    def _gather(self, rows: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None) -> ReplayBufferSamples:
+        """SB3 draws the environment of a row itself: show it one environment at a time, then restore the drawn order."""
+        if self.n_envs == 1:
+            return self._get_samples(rows, env=env)
+        order = np.argsort(env_indices, kind="stable")
+        parts = []
+        for index in np.unique(env_indices):
+            view = copy.copy(self)
+            view.n_envs = 1
+            for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+                setattr(view, name, getattr(self, name)[:, index : index + 1])  # shares memory
+            parts.append(view._get_samples(rows[env_indices == index], env=env))
+        back = th.as_tensor(np.argsort(order), device=self.device)
+        fields = (None if field[0] is None else th.cat(field)[back] for field in zip(*parts, strict=True))
+        return ReplayBufferSamples(*fields)  # type: ignore[arg-type]  # only discounts may be None
+
+    def update_priorities(self, indices: np.ndarray, td_errors: np.ndarray | th.Tensor) -> None:
+        """
+        Give drawn transitions the priority |td_error| + eps. Of a transition drawn twice, the last error counts.
+
+        :param indices: ``indices`` of the samples, shape ``(batch,)``
+        :param td_errors: temporal-difference errors, ``batch`` values in any shape; the sign does not matter
+        :raises ValueError: if the numbers of indices and errors differ, an index is out of range or an error not finite
+        """
+        if isinstance(td_errors, th.Tensor):
+            td_errors = td_errors.detach().cpu().numpy()
+        indices = np.asarray(indices, dtype=np.int64).reshape(-1)
+        priorities = np.abs(np.asarray(td_errors, dtype=np.float64)).reshape(-1) + self.eps
+        if len(indices) != len(priorities):
+            raise ValueError(f"update_priorities: {len(indices)} indices but {len(priorities)} td_errors")
+        if len(indices) == 0:
+            return
+        if not np.all(np.isfinite(priorities)):
+            raise ValueError("update_priorities: td_errors hold values that are not finite")
+        stored = self.size() * self.n_envs
+        if indices.min() < 0 or indices.max() >= stored:
+            raise ValueError(f"update_priorities: indices must lie in [0, {stored}), the stored transitions")
+        self.tree.set(indices, priorities**self.alpha)
+        self.max_priority = max(self.max_priority, float(priorities.max()))
+        self._samples_without_update = 0

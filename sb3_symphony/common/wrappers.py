@@ -1,0 +1,326 @@
+"""
+Gymnasium wrappers, usable by dotted name as ``env_wrapper`` in a YAML configuration.
+
+Three kinds: what makes Box2D episodes repeatable (:class:`FreshBox2DWorld`), what changes the reward a learner sees while
+the reported return stays that of the environment (:class:`LearningReward` and its subclasses), and what changes the task
+(:class:`EpisodeStepLimit`, :class:`TorsoMass`).
+"""
+
+import math
+from abc import abstractmethod
+from typing import Any, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.monitor import Monitor
+
+
+def _find_wrapper(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> Any:
+    """The outermost wrapper of that class around ``env``, or None."""
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, wrapper_class):
+            return env
+        env = env.env
+    return None
+
+
+def _finite(name: str, value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"{name}={value!r}: expected a finite number")
+    return float(value)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Repeatable Box2D episodes
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _has_box2d_world(env: gym.Env) -> bool:
+    world = getattr(env.unwrapped, "world", None)
+    if world is None or not hasattr(env.unwrapped, "_destroy"):
+        return False  # without importing Box2D, which need not be installed
+    try:
+        from Box2D import b2World
+    except ImportError:
+        return False
+    return isinstance(world, b2World)
+
+
+def needs_fresh_world(env: gym.Env) -> bool:
+    """
+    Whether :class:`FreshBox2DWorld` should be put around an environment.
+
+    :param env: any environment
+    :return: True for an environment with a Box2D world (BipedalWalker, LunarLander, CarRacing) not yet wrapped
+    """
+    return _has_box2d_world(env) and _find_wrapper(env, FreshBox2DWorld) is None
+
+
+class FreshBox2DWorld(gym.Wrapper):
+    """
+    Gives a Box2D environment a new world before every reset, so that an episode depends on seed and actions alone.
+
+    Gymnasium's BipedalWalker destroys its bodies at a reset but keeps the world, whose contact solver remembers earlier
+    episodes: the same seed and the same actions then give other observations and rewards. LunarLander makes a new world
+    itself in recent versions of Gymnasium, which this wrapper does not disturb.
+
+    :param env: an environment with a Box2D world
+    :raises TypeError: if the environment has none
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        if not _has_box2d_world(env):
+            raise TypeError(f"FreshBox2DWorld: {env} has no Box2D world (expected one such as BipedalWalker-v3)")
+        super().__init__(env)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: seed of the episode, or None to go on with the environment's generator
+        :param options: handed to the environment
+        :return: first observation and info
+        """
+        from Box2D import b2World
+
+        walker: Any = self.env.unwrapped
+        # Bodies go while their world still exists; the environment's own clean-up then finds nothing left to do
+        walker._destroy()
+        walker.world = b2World(gravity=walker.world.gravity)
+        return self.env.reset(seed=seed, options=options)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Rewards for learning only
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+class LearningReward(gym.Wrapper):
+    """
+    Base of wrappers that change the reward a learner sees, never the one that is reported.
+
+    Reported returns come from ``Monitor``, so it has to sit inside: if there is none, one is put there (SB3 adds its own
+    only where none is found, and would otherwise report changed rewards). ``info["raw_reward"]`` holds the environment's
+    reward of the step, whatever number of these wrappers are stacked. Evaluate without them.
+
+    :param env: environment, with or without a ``Monitor``
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        if _find_wrapper(env, Monitor) is None:
+            env = Monitor(env)
+        super().__init__(env)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        :param action: action of the environment
+        :return: observation, reward for learning, terminated, truncated, info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info.setdefault("raw_reward", float(reward))  # the innermost of these wrappers has set it first
+        return observation, self.learning_reward(observation, float(reward)), terminated, truncated, info
+
+    @abstractmethod
+    def learning_reward(self, observation: Any, reward: float) -> float:
+        """
+        :param observation: observation after the step
+        :param reward: reward of the wrapped environment
+        :return: reward for learning
+        """
+
+
+class RewardFloor(LearningReward):
+    """
+    max(reward, floor): softens a large penalty, such as BipedalWalker's -100 for a fall.
+
+    :param env: environment
+    :param floor: smallest reward, in the environment's units
+    :raises ValueError: if it is not finite
+    """
+
+    def __init__(self, env: gym.Env, floor: float = -10.0) -> None:
+        self.floor = _finite("floor", floor)
+        super().__init__(env)
+
+    def learning_reward(self, observation: Any, reward: float) -> float:
+        return max(reward, self.floor)
+
+
+class RewardScale(LearningReward):
+    """
+    reward · scale.
+
+    :param env: environment
+    :param scale: factor > 0
+    :raises ValueError: if it is not finite and > 0
+    """
+
+    def __init__(self, env: gym.Env, scale: float) -> None:
+        if not (scale > 0 and math.isfinite(scale)):
+            raise ValueError(f"scale={scale!r}: expected a finite number > 0")
+        self.scale = float(scale)
+        super().__init__(env)
+
+    def learning_reward(self, observation: Any, reward: float) -> float:
+        return reward * self.scale
+
+
+class RewardBonus(LearningReward):
+    """
+    reward + bonus in every step.
+
+    :param env: environment
+    :param bonus: added reward, in the environment's units
+    :raises ValueError: if it is not finite
+    """
+
+    def __init__(self, env: gym.Env, bonus: float = 1.0) -> None:
+        self.bonus = _finite("bonus", bonus)
+        super().__init__(env)
+
+    def learning_reward(self, observation: Any, reward: float) -> float:
+        return reward + self.bonus
+
+
+class StallPenalty(LearningReward):
+    """
+    Adds a term that rewards change of the observation and punishes standing still.
+
+    With δ the mean absolute change of the observation in this step: kind A adds coef·(δ - ln(max(1/(δ + 1e-6), 1e-3))),
+    kind B adds -coef·log10(1/clip(δ, 0.1, 10)), which lies in [-coef, coef].
+
+    Source: Symphony's original author (2023-24): kind A with 0.03 in the first version, kind B with 0.07 in the next two.
+
+    :param env: environment with an array observation
+    :param coef: size of the term, >= 0
+    :param kind: ``"A"`` or ``"B"``
+    :raises ValueError: for a coefficient that is not finite and >= 0, or another kind
+    :raises TypeError: if the observation space is not a Box
+    """
+
+    def __init__(self, env: gym.Env, coef: float = 0.07, kind: str = "B") -> None:
+        if not (coef >= 0 and math.isfinite(coef)):
+            raise ValueError(f"coef={coef!r}: expected a finite number >= 0")
+        if kind not in ("A", "B"):
+            raise ValueError(f"kind={kind!r}: expected 'A' or 'B'")
+        if not isinstance(env.observation_space, gym.spaces.Box):
+            raise TypeError(f"StallPenalty: expected a Box observation space, got {env.observation_space}")
+        self.coef = float(coef)
+        self.kind = kind
+        super().__init__(env)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: seed of the episode
+        :param options: handed to the environment
+        :return: first observation and info
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.previous = np.array(observation, dtype=np.float64)
+        return observation, info
+
+    def learning_reward(self, observation: Any, reward: float) -> float:
+        current = np.array(observation, dtype=np.float64)
+        delta = float(np.mean(np.abs(current - self.previous)))
+        self.previous = current
+        if self.kind == "A":
+            return reward + self.coef * (delta - math.log(max(1.0 / (delta + 1e-6), 1e-3)))
+        return reward - self.coef * math.log10(1.0 / min(max(delta, 0.1), 10.0))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Changes of the task
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+class EpisodeStepLimit(gym.Wrapper):
+    """
+    Cuts episodes at ``max_steps`` as long as fewer than ``until_total_steps`` steps were taken in all (a warm-up cut).
+
+    A cut is a truncation, as by Gymnasium's ``TimeLimit``: SB3 bootstraps through it. For training only. With parallel
+    environments each counts its own steps. ``total_steps`` may be set when training is resumed.
+
+    If a ``Monitor`` is already there, the limit goes beneath it, so that cut episodes are reported like any other.
+
+    :param env: environment
+    :param max_steps: length of the cut episodes, >= 1
+    :param until_total_steps: number of steps of this environment after which episodes are left alone, >= 0
+    :raises ValueError: for a value outside the ranges above
+    """
+
+    def __init__(self, env: gym.Env, max_steps: int, until_total_steps: int) -> None:
+        if not max_steps >= 1:
+            raise ValueError(f"max_steps={max_steps!r}: expected an integer >= 1")
+        if not until_total_steps >= 0:
+            raise ValueError(f"until_total_steps={until_total_steps!r}: expected an integer >= 0")
+        super().__init__(env)
+        self.max_steps = max_steps
+        self.until_total_steps = until_total_steps
+        self._total_steps = 0
+        self._episode_steps = 0
+        self._inner: EpisodeStepLimit | None = None
+        monitor = _find_wrapper(env, Monitor)
+        if monitor is not None:
+            self._inner = monitor.env = EpisodeStepLimit(monitor.env, max_steps, until_total_steps)
+
+    @property
+    def total_steps(self) -> int:
+        """Steps taken in all, over all episodes."""
+        return self._total_steps if self._inner is None else self._inner.total_steps
+
+    @total_steps.setter
+    def total_steps(self, value: int) -> None:
+        if self._inner is None:
+            self._total_steps = value
+        else:
+            self._inner.total_steps = value
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: seed of the episode
+        :param options: handed to the environment
+        :return: first observation and info
+        """
+        self._episode_steps = 0
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        :param action: action of the environment
+        :return: observation, reward, terminated, truncated (also where the episode is cut), info
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._inner is None:
+            self._episode_steps += 1
+            if self._total_steps < self.until_total_steps and self._episode_steps >= self.max_steps:
+                truncated = True
+            self._total_steps += 1
+        return observation, reward, terminated, truncated, info
+
+
+class TorsoMass(gym.Wrapper):
+    """
+    Changes the mass of the body ``torso`` of a MuJoCo environment (Hopper, Walker2d, HalfCheetah, Ant, …).
+
+    The mass holds from the first reset on, over all episodes. Only the mass changes, not the inertia; the constants
+    that MuJoCo derives from masses when it compiles a model are computed anew.
+
+    :param env: MuJoCo environment, such as Hopper-v4 or Hopper-v5
+    :param mass: new mass in kg, > 0 (Hopper's own: 3.665)
+    :raises TypeError: if the environment is not a MuJoCo one or has no body named ``torso``
+    :raises ValueError: if the mass is not finite and > 0
+    """
+
+    def __init__(self, env: gym.Env, mass: float) -> None:
+        if not (mass > 0 and math.isfinite(mass)):
+            raise ValueError(f"mass={mass!r}: expected a finite number > 0, in kg")
+        model: Any = getattr(env.unwrapped, "model", None)
+        if not hasattr(model, "body_mass"):
+            raise TypeError(f"TorsoMass: {env} is not a MuJoCo environment")
+        import mujoco
+
+        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "torso")
+        if body < 0:
+            raise TypeError(f"TorsoMass: {env} has no body named 'torso'")
+        super().__init__(env)
+        self.mass = float(mass)
+        model.body_mass[body] = self.mass
+        mujoco.mj_setConst(model, mujoco.MjData(model))  # on scratch data: it overwrites the state
