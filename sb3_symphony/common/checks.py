@@ -1,0 +1,58 @@
+"""Argument checks: one clear line that names the argument, its value and what was expected."""
+
+import difflib
+import math
+from collections.abc import Iterable
+from typing import Any
+
+
+def check_number(
+    name: str, value: Any, low: float = -math.inf, high: float = math.inf, integer: bool = False, exclusive: bool = False
+) -> None:
+    """
+    Refuse anything but a finite number in ``[low, high]``.
+
+    :param name: The argument's name
+    :param value: Its value
+    :param low: Smallest value allowed
+    :param high: Largest value allowed
+    :param integer: Whether only whole numbers are allowed
+    :param exclusive: Whether ``low`` itself is refused
+    :raises TypeError: if ``value`` is no number (of the kind asked for)
+    :raises ValueError: if ``value`` is not finite or out of range
+    """
+    kind = "an integer" if integer else "a number"
+    bounds = f" {'>' if exclusive else '>='} {low:g}" if low > -math.inf else ""
+    bounds += f"{' and' if bounds else ''} <= {high:g}" if high < math.inf else ""
+    message = f"{name}={value!r}: expected {kind}{bounds}"
+    number = int(value) if hasattr(value, "__index__") else value
+    if isinstance(value, bool) or not isinstance(number, int if integer else (int, float)):
+        raise TypeError(message)
+    if not math.isfinite(number) or not low <= number <= high or (exclusive and number == low):
+        raise ValueError(message)
+
+
+def check_choice(name: str, value: Any, options: Iterable[Any]) -> None:
+    """
+    Refuse a value that is not one of the options.
+
+    :param name: The argument's name
+    :param value: Its value
+    :param options: What is allowed
+    :raises ValueError: naming the options and the nearest one
+    """
+    options = list(options)
+    if value not in options:
+        raise ValueError(f"{name}={value!r}: expected one of {', '.join(map(repr, options))}{suggestion(value, options)}")
+
+
+def suggestion(value: Any, options: Iterable[Any]) -> str:
+    """
+    The end of an error message that suggests the nearest spelling.
+
+    :param value: What was given
+    :param options: What is known
+    :return: ``": did you mean 'x'?"``, or ``""`` if nothing is near
+    """
+    nearest = difflib.get_close_matches(str(value), [str(option) for option in options], n=1)
+    return f": did you mean {nearest[0]!r}?" if nearest else ""

@@ -1,0 +1,233 @@
+"""What Symphony and REDQ share: everything that SB3 expects of an off-policy algorithm with an ensemble of critics."""
+
+import inspect
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer
+from sb3_symphony.common.checks import check_choice, check_number
+from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
+from sb3_symphony.common.losses import CRITIC_LOSSES
+from sb3_symphony.common.regression import CriticRegression
+
+N_STEP_BUFFERS = (NStepReplayBuffer, FadingReplayBuffer, FadingDictReplayBuffer, PrioritizedReplayBuffer)
+MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
+
+
+class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """
+    Base class of Symphony and REDQ. Its arguments are those of SB3's ``OffPolicyAlgorithm``.
+
+    :param n_critics: Number of critics; may be given in ``policy_kwargs`` instead
+    :param policy_delay: Critic updates per actor update
+    :param target_mode: How the target combines the critics: ``"min"``, ``"mean"`` or ``"rem"``
+    :param critic_loss: Error function, see :data:`sb3_symphony.common.losses.CRITIC_LOSSES`
+    :param critic_reduction: ``"independent"`` (each critic meets the target) or ``"ensemble_mean"`` (their mean does)
+    :raises ValueError: if an argument is out of range, or the action space no bounded Box
+    :raises TypeError: if an argument has the wrong type
+    """
+
+    critic: EnsembleCritic
+    critic_target: EnsembleCritic
+    # Buffers used without ``replay_buffer_class``: for Dict observations, for n-step returns, otherwise
+    default_buffers: ClassVar[tuple[type[ReplayBuffer], type[ReplayBuffer], type[ReplayBuffer]]] = (
+        DictReplayBuffer,
+        NStepReplayBuffer,
+        ReplayBuffer,
+    )
+
+    def __init__(
+        self,
+        *args: Any,
+        n_critics: int,
+        policy_delay: int,
+        target_mode: str,
+        critic_loss: str,
+        critic_reduction: str = "independent",
+        policy_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        policy_kwargs = dict(policy_kwargs or {})  # the caller's own stays as it is
+        default = inspect.signature(type(self)).parameters["n_critics"].default
+        in_policy = policy_kwargs.setdefault("n_critics", n_critics)
+        if n_critics not in (default, in_policy):
+            raise ValueError(f"n_critics={n_critics!r}, but policy_kwargs has n_critics={in_policy!r}: give one of them")
+        try:
+            super().__init__(
+                *args, policy_kwargs=policy_kwargs, supported_action_spaces=(spaces.Box,), support_multi_env=True, **kwargs
+            )
+        except AssertionError as error:  # SB3 asserts what is a user's error: the kind of the action space
+            raise ValueError(str(error)) from error
+        self.n_critics = in_policy
+        self.policy_delay = policy_delay
+        self.target_mode = target_mode
+        self.critic_loss = critic_loss
+        self.critic_reduction = critic_reduction
+        self._timesteps_at_update = 0
+        self._check_arguments()
+
+    def _check_arguments(self) -> None:
+        if not callable(self.learning_rate):
+            check_number("learning_rate", self.learning_rate, 0)
+        check_number("buffer_size", self.buffer_size, 1, integer=True)
+        check_number("learning_starts", self.learning_starts, 0, integer=True)
+        if self.batch_size is not None:
+            check_number("batch_size", self.batch_size, 1, integer=True)
+        check_number("tau", self.tau, 0, 1)
+        check_number("gamma", self.gamma, 0, 1)
+        check_number("gradient_steps", self.gradient_steps, -1, integer=True)
+        check_number("n_steps", self.n_steps, 1, integer=True)
+        check_number("n_critics", self.n_critics, 1, integer=True)
+        check_number("policy_delay", self.policy_delay, 1, integer=True)
+        check_choice("target_mode", self.target_mode, TARGET_MODES)
+        check_choice("critic_loss", self.critic_loss, CRITIC_LOSSES)
+        check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
+        if self.optimize_memory_usage and self.n_steps > 1:
+            raise ValueError("optimize_memory_usage=True: n-step returns need n_steps=1 then")
+
+    # ---------------------------------------------------------------- set-up
+
+    def _setup_model(self) -> None:
+        n_steps, chosen = self.n_steps, self.replay_buffer_class
+        if isinstance(self.observation_space, spaces.Dict) and n_steps > 1:
+            raise ValueError(f"n_steps={n_steps}: expected 1 for Dict observations, as in SB3")
+        if chosen is None:
+            for_dict, for_n_steps, otherwise = self.default_buffers
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            self.replay_buffer_class = chosen = for_dict if is_dict else for_n_steps if n_steps > 1 else otherwise
+        if n_steps > 1:
+            if not issubclass(chosen, N_STEP_BUFFERS):
+                raise ValueError(f"n_steps={n_steps}: {chosen.__name__} has no n-step returns, expected n_steps=1")
+            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": n_steps, "gamma": self.gamma}
+        # SB3 takes a given class for one without n-step returns, and warns: the buffer has its horizon already
+        self.n_steps = 1
+        super()._setup_model()
+        self.n_steps = n_steps
+        self._create_aliases()
+        self._regression = CriticRegression(self.critic, self.critic_target, self.critic_loss, self.critic_reduction)
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        assert self.env is not None, "You must set the environment before calling learn()"
+        noise = self.action_noise
+        if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.env.num_envs:
+            # The model was loaded with another number of environments: go on from the first one's state
+            self.action_noise = noise = noise.noises[0]
+        if noise is not None and self.env.num_envs > 1 and not isinstance(noise, VectorizedActionNoise):
+            self.action_noise = noise = VectorizedActionNoise(noise, self.env.num_envs)
+        for each in noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]:
+            if hasattr(each, "n_envs"):
+                each.n_envs = self.env.num_envs  # a decay counts environment steps
+        return super()._setup_learn(*args, **kwargs)
+
+    # ---------------------------------------------------------------- training
+
+    def _segments(
+        self, gradient_steps: int, batch_size: int, **sample_kwargs: Any
+    ) -> Iterator[tuple[ReplayBufferSamples, list[ReplayBufferSamples]]]:
+        """
+        Draw ``gradient_steps`` minibatches and cut them where the actor changes.
+
+        Inside a segment the actor is frozen, so its next actions can be computed for all minibatches at once. A segment
+        ends before every ``policy_delay``-th update (counted over the model's life) has been followed by an actor step.
+
+        :param gradient_steps: Number of critic updates
+        :param batch_size: Transitions per update
+        :param sample_kwargs: Passed to ``replay_buffer.sample``
+        :return: Pairs of a segment's transitions and the same as minibatches
+        """
+        assert self.replay_buffer is not None
+        sizes = [np.prod(space.shape) for space in self._observation_spaces()]
+        updates_per_draw = max(1, int(MAX_SAMPLE_BYTES // (8 * sum(sizes) * batch_size)))
+        while gradient_steps > 0:
+            draw = min(gradient_steps, updates_per_draw)
+            samples = self.replay_buffer.sample(draw * batch_size, env=self._vec_normalize_env, **sample_kwargs)
+            start = 0
+            while start < draw:
+                length = min(draw - start, self.policy_delay - self._n_updates % self.policy_delay)
+                batches = [_rows(samples, (start + i) * batch_size, batch_size) for i in range(length)]
+                yield _rows(samples, start * batch_size, length * batch_size), batches
+                start += length
+            gradient_steps -= draw
+
+    def _observation_spaces(self) -> list[spaces.Space]:
+        space = self.observation_space
+        return list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+
+    def _update_priorities(self, batch: ReplayBufferSamples, target: th.Tensor, q_values: th.Tensor) -> None:
+        """Priority of a transition: its error averaged over the critics. Nothing to do for other buffers."""
+        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
+            error = (target - q_values).abs().mean(dim=0)  # (batch, 1)
+            self.replay_buffer.update_priorities(batch.indices, error.flatten().cpu().numpy())  # type: ignore[attr-defined]
+
+    def _discounts(self, batch: ReplayBufferSamples) -> th.Tensor | float:
+        """Discount of the bootstrap value: ``gamma`` to the power of the steps summed in ``rewards``."""
+        return self.gamma if batch.discounts is None else batch.discounts
+
+    def _log_update(self, n_updates_before: int, means: dict[str, list[th.Tensor]], noise_std: th.Tensor | float) -> None:
+        """
+        Record the mean of each quantity over the updates of one ``train()`` call: the only transfer off the device.
+
+        :param n_updates_before: ``_n_updates`` when the call began
+        :param means: Log key (without ``train/``) to scalars, one per update
+        :param noise_std: Standard deviation of the exploration noise in [-1, 1] action units
+        """
+        if self.num_timesteps < self._timesteps_at_update:  # learn() was called anew and the count restarted
+            self._timesteps_at_update = 0
+        transitions = max(1, self.num_timesteps - self._timesteps_at_update)
+        ratio = (self._n_updates - n_updates_before) / transitions
+        self._timesteps_at_update = self.num_timesteps
+
+        kept = {key: th.stack(values).mean() for key, values in means.items() if values}
+        if isinstance(noise_std, th.Tensor):
+            kept["noise_std"] = noise_std
+        else:
+            self.logger.record("train/noise_std", noise_std)
+        for key, value in zip(kept, th.stack(list(kept.values())).tolist(), strict=True):
+            self.logger.record(f"train/{key}", value)
+        self.logger.record("train/update_ratio", ratio)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    # ---------------------------------------------------------------- saving
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def _rows(samples: ReplayBufferSamples, start: int, length: int) -> Any:
+    """``length`` rows of every field, from ``start`` on."""
+
+    def cut(field: Any) -> Any:
+        if isinstance(field, dict):
+            return {key: cut(value) for key, value in field.items()}
+        return None if field is None else field[start : start + length]
+
+    return type(samples)(*map(cut, samples))
+
+
+def noise_std(action_noise: ActionNoise | None) -> float:
+    """
+    Current standard deviation of an action noise, averaged over its dimensions and environments.
+
+    :param action_noise: SB3's or one of :mod:`sb3_symphony.common.noise`; ``None`` counts as 0
+    """
+    if action_noise is None:
+        return 0.0
+    if isinstance(action_noise, VectorizedActionNoise):
+        return float(np.mean([noise_std(noise) for noise in action_noise.noises]))
+    return float(np.mean(getattr(action_noise, "sigma_t", getattr(action_noise, "_sigma", np.nan))))

@@ -1,0 +1,143 @@
+from collections.abc import Sequence
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
+
+from sb3_symphony.common.ensembles import EnsembleCritic
+
+
+def xavier_(module: nn.Module) -> None:
+    """Xavier-uniform weights and zero biases in a linear layer, as in the authors' code."""
+    if isinstance(module, nn.Linear):
+        nn.init.xavier_uniform_(module.weight)
+        nn.init.zeros_(module.bias)
+
+
+class REDQPolicy(SACPolicy):
+    """
+    Policy class (with both actor and critics) for REDQ and DroQ: SB3's SAC actor and an ensemble of critics.
+
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: The specification of the actor's and the critics' networks, two layers of 256 by default
+    :param activation_fn: Activation function
+    :param use_sde: Whether to use State Dependent Exploration or not
+    :param log_std_init: Initial value for the log standard deviation
+    :param use_expln: Use ``expln()`` function instead of ``exp()`` when using gSDE to ensure a positive standard deviation
+    :param clip_mean: Clip the mean output when using gSDE to avoid numerical instability
+    :param features_extractor_class: Features extractor to use
+    :param features_extractor_kwargs: Keyword arguments to pass to the features extractor
+    :param normalize_images: Whether to normalize images or not, dividing by 255.0 (True by default)
+    :param optimizer_class: The optimizer to use, ``th.optim.Adam`` by default
+    :param optimizer_kwargs: Additional keyword arguments, excluding the learning rate, to pass to the optimizer
+    :param n_critics: Number of critics
+    :param share_features_extractor: Whether to share or not the features extractor between the actor and the critics
+    :param layer_norm: Whether the critics normalise each hidden layer before its activation
+    :param dropout_rate: Dropout after the critics' hidden linear layers, active in the targets too (DroQ)
+    """
+
+    critic: EnsembleCritic  # type: ignore[assignment]
+    critic_target: EnsembleCritic  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        use_sde: bool = False,
+        log_std_init: float = -3,
+        use_expln: bool = False,
+        clip_mean: float = 2.0,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 10,
+        share_features_extractor: bool = False,
+        layer_norm: bool | Sequence[bool] = False,
+        dropout_rate: float = 0.0,
+    ) -> None:
+        self.layer_norm, self.dropout_rate = layer_norm, dropout_rate  # before the parent, which builds the networks
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch,
+            activation_fn,
+            use_sde,
+            log_std_init,
+            use_expln,
+            clip_mean,
+            features_extractor_class,
+            features_extractor_kwargs,
+            normalize_images,
+            optimizer_class,
+            optimizer_kwargs,
+            n_critics,
+            share_features_extractor,
+        )
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        actor = super().make_actor(features_extractor)
+        for part in (actor.latent_pi, actor.mu, actor.log_std):
+            if isinstance(part, nn.Module):
+                part.apply(xavier_)
+        return actor
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
+        critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return EnsembleCritic(
+            **critic_kwargs, layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, init="xavier"
+        ).to(self.device)
+
+    def set_training_mode(self, mode: bool) -> None:
+        super().set_training_mode(mode)
+        # SB3 keeps targets in evaluation mode; DroQ's dropout is active in them too
+        self.critic_target.set_training_mode(mode and self.dropout_rate > 0)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate)
+        return data
+
+
+MlpPolicy = REDQPolicy
+
+
+class CnnPolicy(REDQPolicy):
+    """
+    Policy class (with both actor and critics) for REDQ on images: :class:`REDQPolicy` with ``NatureCNN`` as the default
+    features extractor. Arguments as there.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+class MultiInputPolicy(REDQPolicy):
+    """
+    Policy class (with both actor and critics) for REDQ on Dict observations: :class:`REDQPolicy` with
+    ``CombinedExtractor`` as the default features extractor. Arguments as there.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

@@ -1,0 +1,291 @@
+from collections import defaultdict
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.sac.policies import Actor
+
+from sb3_symphony.common.checks import check_number
+from sb3_symphony.common.ensembles import combine
+from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm
+from sb3_symphony.redq.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, REDQPolicy
+
+SelfREDQ = TypeVar("SelfREDQ", bound="REDQ")
+
+# Target entropies of the MBPO paper, which the authors of REDQ use by default; other environments: minus the dimension
+MBPO_TARGET_ENTROPY = {"Hopper": -1.0, "HalfCheetah": -3.0, "Walker2d": -3.0, "Ant": -4.0, "Humanoid": -2.0}
+
+
+class REDQ(EnsembleOffPolicyAlgorithm):
+    """
+    Randomized Ensembled Double Q-Learning (REDQ): SAC with many updates per step, an ensemble of critics, and targets
+    that take the minimum over a random subset of them.
+
+    Paper: https://arxiv.org/abs/2101.05982
+    Original implementation: https://github.com/watchernyu/REDQ
+    Differences from it, of one optimiser step each: the actor follows the critics *after* their step (as in SB3), and
+    the temperature really starts at the value that is used (the original starts at 0.2 and jumps to 1).
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: Learning rate of all Adam optimizers (critics, actor and entropy coefficient),
+        a value or a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: Size of the replay buffer, in transitions
+    :param learning_starts: How many steps of random actions to collect before learning starts
+    :param batch_size: Minibatch size of each gradient update
+    :param tau: The soft update coefficient ("Polyak update", between 0 and 1), applied after every critic update
+    :param gamma: The discount factor
+    :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(2, "episode")``
+    :param gradient_steps: Critic updates after each rollout (``G`` in the paper); -1: as many as steps were collected.
+        With several environments one vector step counts as one: multiply by ``n_envs`` for the same update ratio
+    :param action_noise: Noise added to the stochastic policy's actions (none by default)
+    :param replay_buffer_class: Replay buffer class, selected automatically if ``None``
+    :param replay_buffer_kwargs: Keyword arguments of the replay buffer
+    :param optimize_memory_usage: Memory efficient variant of the replay buffer, see SB3
+    :param n_steps: Horizon of n-step returns
+    :param n_critics: Number of critics (``N`` in the paper)
+    :param subset_size: Size of the random subset in the target (``M``). A fraction is a random size: 1.5 means 1 or 2
+        with equal probability. ``"all"`` takes the minimum over all critics
+    :param policy_delay: Critic updates per update of the actor and the entropy coefficient
+    :param target_mode: How the target combines the critics: ``"min"`` over the subset, ``"mean"`` over all, or ``"rem"``,
+        a random convex combination of all
+    :param critic_loss: Error function of the critics: ``"mse"``, ``"huber"``, ``"rehe"`` or ``"rehe_elementwise"``
+    :param critic_reduction: ``"independent"``: every critic fits the target; ``"ensemble_mean"``: their mean does
+    :param ent_coef: Entropy regularization coefficient. ``"auto"`` learns it (``"auto_0.1"``: starting from 0.1)
+    :param target_entropy: Target entropy when learning ``ent_coef``: a number, ``"auto"`` (minus the action dimension) or
+        ``"mbpo"`` (the table the authors use for MuJoCo environments)
+    :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE (-1: only at a rollout's start)
+    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling before learning starts
+    :param stats_window_size: Number of episodes to average the reported success rate, length and reward over
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Arguments of the policy, see :class:`~sb3_symphony.redq.policies.REDQPolicy`
+    :param verbose: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should run
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: if an argument is out of range
+    :raises TypeError: if an argument has the wrong type
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: REDQPolicy
+    actor: Actor
+
+    def __init__(
+        self,
+        policy: str | type[REDQPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 5000,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 20,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        n_critics: int = 10,
+        subset_size: int | float | str = 2,
+        policy_delay: int = 20,
+        target_mode: str = "min",
+        critic_loss: str = "mse",
+        critic_reduction: str = "independent",
+        ent_coef: str | float = "auto",
+        target_entropy: str | float = "auto",
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            n_critics=n_critics,
+            policy_delay=policy_delay,
+            target_mode=target_mode,
+            critic_loss=critic_loss,
+            critic_reduction=critic_reduction,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+        )
+        self.subset_size = subset_size
+        self.ent_coef = ent_coef
+        self.target_entropy = target_entropy
+        self.log_ent_coef: th.Tensor | None = None
+        self.ent_coef_optimizer: th.optim.Adam | None = None
+        if subset_size != "all":
+            check_number("subset_size", subset_size, 1)
+            if float(subset_size) > self.n_critics:
+                raise ValueError(f"subset_size={subset_size!r}: expected at most n_critics={self.n_critics}")
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.target_entropy = self._resolve_target_entropy()
+        learned = isinstance(self.ent_coef, str) and self.ent_coef.partition("_")[0] == "auto"
+        initial = (self.ent_coef.partition("_")[2] or 1.0) if learned else self.ent_coef  # type: ignore[union-attr]
+        try:
+            initial = float(initial)
+        except ValueError:
+            raise ValueError(f"ent_coef={self.ent_coef!r}: expected a number, 'auto' or 'auto_<initial value>'") from None
+        check_number("ent_coef", initial, 0, exclusive=learned)
+        if learned:
+            # The log is optimised, as in SB3
+            self.log_ent_coef = th.full((1,), np.log(initial), device=self.device, dtype=th.float32).requires_grad_()
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
+        else:
+            self.ent_coef_tensor = th.tensor(initial, device=self.device)
+
+    def _resolve_target_entropy(self) -> float:
+        if self.target_entropy == "mbpo" and self.env is not None:
+            spec = self.env.get_attr("spec")[0]
+            name = spec.id.rpartition("/")[2].partition("-")[0] if spec is not None else ""
+            return MBPO_TARGET_ENTROPY.get(name, -float(np.prod(self.action_space.shape)))
+        if self.target_entropy in ("auto", "mbpo"):
+            return -float(np.prod(self.action_space.shape))
+        try:
+            value = float(self.target_entropy)
+        except ValueError:
+            raise ValueError(f"target_entropy={self.target_entropy!r}: expected a number, 'auto' or 'mbpo'") from None
+        check_number("target_entropy", value)
+        return value
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        # Switch to train mode (this affects dropout, in the targets too)
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers.append(self.ent_coef_optimizer)
+        self._update_learning_rate(optimizers)
+
+        n_updates_before = self._n_updates
+        logs: dict[str, list[th.Tensor]] = defaultdict(list)
+
+        # The actor and the temperature are frozen inside a segment: one forward pass gives all its next actions
+        for segment, batches in self._segments(gradient_steps, batch_size):
+            with th.no_grad():
+                if self.use_sde:
+                    self.actor.reset_noise()
+                ent_coef = self._current_ent_coef()
+                next_actions, next_log_probs = self.actor.action_log_prob(segment.next_observations)
+                next_actions, entropies = next_actions.split(batch_size), (-ent_coef * next_log_probs).split(batch_size)
+
+            for batch, next_action, entropy in zip(batches, next_actions, entropies, strict=True):
+                with th.no_grad():
+                    # Minimum over the subset, one draw for the whole batch: (subset_size, batch, 1) -> (batch, 1)
+                    next_q_values = self.critic_target(batch.next_observations, next_action, self._draw_subset())
+                    next_values = combine(next_q_values, self.target_mode) + entropy.reshape(-1, 1)
+                    target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
+
+                weights = getattr(batch, "weights", None)
+                loss, q_values = self._regression.fit(batch.observations, batch.actions, target, self.tau, weights)
+                self._update_priorities(batch, target, q_values)
+                self._n_updates += 1
+
+                logs["critic_loss"].append(loss)
+                logs["q_mean"].append(q_values.mean())
+                logs["q_std"].append(q_values.std(dim=0, correction=0).mean())
+                logs["target_q_mean"].append(target.mean())
+
+            if self._n_updates % self.policy_delay == 0:
+                self._update_actor(batches[-1], ent_coef, logs)
+
+        # Of the untransformed Gaussian that acted last
+        noise_std = self.actor.action_dist.distribution.stddev.detach().mean()
+        self._log_update(n_updates_before, logs, noise_std)
+
+    def _update_actor(self, batch: ReplayBufferSamples, ent_coef: th.Tensor, logs: dict[str, list[th.Tensor]]) -> None:
+        """One step of the actor toward the mean of all critics, then one of the entropy coefficient."""
+        if self.use_sde:
+            self.actor.reset_noise()
+        actions, log_prob = self.actor.action_log_prob(batch.observations)
+        log_prob = log_prob.reshape(-1, 1)
+        actor_loss = (ent_coef * log_prob - self.critic(batch.observations, actions).mean(dim=0)).mean()
+        self.actor.optimizer.zero_grad()
+        actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
+        self.actor.optimizer.step()
+        logs["actor_loss"].append(actor_loss.detach())
+        logs["ent_coef"].append(ent_coef.mean())
+
+        if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+            ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+            self.ent_coef_optimizer.zero_grad()
+            ent_coef_loss.backward()
+            self.ent_coef_optimizer.step()
+            logs["ent_coef_loss"].append(ent_coef_loss.detach())
+
+    def _current_ent_coef(self) -> th.Tensor:
+        return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()
+
+    def _draw_subset(self) -> list[int] | None:
+        """Indices of the critics in the target; ``None`` stands for all of them."""
+        if self.target_mode != "min" or self.subset_size in ("all", self.n_critics):
+            return None
+        size = int(self.subset_size)
+        size += int(np.random.random() < float(self.subset_size) - size)
+        return np.random.permutation(self.n_critics)[:size].tolist()
+
+    def learn(
+        self: SelfREDQ,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "REDQ",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfREDQ:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        if self.ent_coef_optimizer is None:
+            return state_dicts, [*tensors, "ent_coef_tensor"]
+        return [*state_dicts, "ent_coef_optimizer"], [*tensors, "log_ent_coef"]

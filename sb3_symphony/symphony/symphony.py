@@ -1,0 +1,283 @@
+from collections import defaultdict
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+
+from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
+from sb3_symphony.common.checks import check_choice, check_number
+from sb3_symphony.common.ensembles import combine
+from sb3_symphony.common.losses import ACTOR_LOSSES
+from sb3_symphony.common.noise import DecayingNormalActionNoise
+from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm, noise_std
+from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
+
+SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
+
+
+class Symphony(EnsembleOffPolicyAlgorithm):
+    """
+    Symphony: a deterministic actor without target, the minimum over several critics, Fourier blocks (sine and leaky
+    ReLU), rectified Huber losses of batch means, and a replay that fades old transitions out.
+
+    Sources: Read (2024), "Dancing like the Inbetweeners: learning to walk with Symphony"; the author's code (Ishuov),
+    https://github.com/timurgepard/Simphony, for all numbers that the paper leaves open (version of February 2024).
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, MultiInputPolicy)
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: Learning rate of the actor's Adam optimizer,
+        a value or a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: Size of the replay buffer, in transitions
+    :param learning_starts: How many steps to collect before learning starts
+    :param batch_size: Minibatch size of each gradient update. ``None`` lets it grow with the number ``N`` of stored
+        transitions, ``N / 500`` but between 128 and 1024
+    :param tau: The soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: The discount factor
+    :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(2, "episode")``
+    :param gradient_steps: Updates after each rollout; -1: as many as steps were collected.
+        With several environments one vector step counts as one: multiply by ``n_envs`` for the same update ratio
+    :param action_noise: Exploration noise. ``"default"``: Gaussian with a standard deviation that falls from 0.3 to 0
+        along a cosine within 104,720 steps, clipped at 2.5 standard deviations
+    :param replay_buffer_class: Replay buffer class; ``None``: one that fades old transitions out
+    :param replay_buffer_kwargs: Keyword arguments of the replay buffer, such as ``fade_factor``
+    :param optimize_memory_usage: Memory efficient variant of the replay buffer (not of the fading one), see SB3
+    :param n_steps: Horizon of n-step returns
+    :param critic_learning_rate: Learning rate of the critics' optimizer, likewise a value or a function;
+        ``None``: that of the actor
+    :param n_critics: Number of independent critics, each with its own target. Read's paper: one is the original
+        algorithm, two the enhanced one; the author's code has three
+    :param policy_delay: Critic updates per actor update
+    :param target_mode: How the critics are combined, in the target and for the actor: ``"min"``, ``"mean"`` or ``"rem"``
+    :param min_mix: Weight of the minimum, the rest is on the mean
+    :param critic_loss: Error function of the critics: ``"rehe"``, ``"rehe_elementwise"``, ``"huber"`` or ``"mse"``
+    :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
+    :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
+    :param episode_gradient_steps: Additional updates at the start of each episode
+    :param warmup_policy: Who acts before learning starts: ``"actor"``, with weights drawn anew for each episode, or
+        ``"uniform"`` random actions
+    :param stats_window_size: Number of episodes to average the reported success rate, length and reward over
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Arguments of the policy, see :class:`~sb3_symphony.symphony.policies.SymphonyPolicy`
+    :param verbose: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should run
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ValueError: if an argument is out of range
+    :raises TypeError: if an argument has the wrong type
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: SymphonyPolicy
+    actor: Actor
+    default_buffers = (FadingDictReplayBuffer, FadingReplayBuffer, FadingReplayBuffer)
+
+    def __init__(
+        self,
+        policy: str | type[SymphonyPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 500_000,
+        learning_starts: int = 5000,
+        batch_size: int | None = None,
+        tau: float = 0.003,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 3,
+        action_noise: ActionNoise | str | None = "default",
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        critic_learning_rate: float | Schedule | None = 7e-4,
+        n_critics: int = 2,
+        policy_delay: int = 1,
+        target_mode: str = "min",
+        min_mix: float = 1.0,
+        critic_loss: str = "rehe",
+        actor_loss: str = "rehae",
+        initial_gradient_steps: tuple[int, int] = (64, 64),
+        episode_gradient_steps: int = 40,
+        warmup_policy: str = "actor",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            n_critics=n_critics,
+            policy_delay=policy_delay,
+            target_mode=target_mode,
+            critic_loss=critic_loss,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+        )
+        self.critic_learning_rate = critic_learning_rate
+        self.min_mix = min_mix
+        self.actor_loss = actor_loss
+        self.initial_gradient_steps = tuple(initial_gradient_steps)
+        self.episode_gradient_steps = episode_gradient_steps
+        self.warmup_policy = warmup_policy
+
+        if critic_learning_rate is not None and not callable(critic_learning_rate):
+            check_number("critic_learning_rate", critic_learning_rate, 0)
+        check_number("min_mix", min_mix, 0, 1)
+        check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
+        if len(self.initial_gradient_steps) != 2:
+            raise ValueError(f"initial_gradient_steps={initial_gradient_steps!r}: expected two numbers (uniform, faded)")
+        for n_updates in self.initial_gradient_steps:
+            check_number("initial_gradient_steps", n_updates, 0, integer=True)
+        check_number("episode_gradient_steps", episode_gradient_steps, 0, integer=True)
+        check_choice("warmup_policy", warmup_policy, ("actor", "uniform"))
+        if isinstance(action_noise, str):
+            check_choice("action_noise", action_noise, ("default",))
+
+        self._redraw_actor = True  # an episode begins
+        self._new_episodes = 0  # begun since the last update
+        self._initial_updates_done = False
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
+        self.critic_lr_schedule = FloatSchedule(rate)
+        if isinstance(self.action_noise, str):
+            self.action_noise = DecayingNormalActionNoise(int(np.prod(self.action_space.shape)))
+        # Mean value at the previous update, which the actor's loss compares with
+        self.baseline = th.zeros((), device=self.device)
+
+    def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
+        # Switch to train mode (this affects dropout)
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.actor.optimizer)
+        update_learning_rate(self.critic.optimizer, self.critic_lr_schedule(self._current_progress_remaining))
+
+        assert self.replay_buffer is not None
+        stored = self.replay_buffer.size() * self.n_envs
+        batch_size = batch_size or min(max(stored // 500, 128), 1024)
+
+        n_updates_before = self._n_updates
+        logs: dict[str, list[th.Tensor]] = defaultdict(list)
+        if not self._initial_updates_done:
+            uniform, faded = self.initial_gradient_steps
+            fades = isinstance(self.replay_buffer, (FadingReplayBuffer, FadingDictReplayBuffer))
+            self._update(uniform, batch_size, logs, **(dict(uniform=True) if fades else {}))
+            self._update(faded, batch_size, logs)
+            self._initial_updates_done = True
+        self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
+        self._new_episodes = 0
+        self._log_update(n_updates_before, logs, noise_std(self.action_noise))
+
+    def _update(self, gradient_steps: int, batch_size: int, logs: dict[str, list[th.Tensor]], **sample_kwargs: Any) -> None:
+        # The actor is frozen inside a segment: one forward pass gives all its next actions
+        for segment, batches in self._segments(gradient_steps, batch_size, **sample_kwargs):
+            with th.no_grad():
+                next_actions = self.actor(segment.next_observations).split(batch_size)
+
+            for batch, next_action in zip(batches, next_actions, strict=True):
+                with th.no_grad():
+                    # The online actor, without noise; minimum over the critics: (n_critics, batch, 1) -> (batch, 1)
+                    next_q_values = self.critic_target(batch.next_observations, next_action)
+                    next_values = combine(next_q_values, self.target_mode, self.min_mix)
+                    target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
+
+                # The author moves the target critics before he computes the target; moving them right after the
+                # critics' step, as here, gives the same numbers
+                weights = getattr(batch, "weights", None)
+                loss, q_values = self._regression.fit(batch.observations, batch.actions, target, self.tau, weights)
+                self._update_priorities(batch, target, q_values)
+                self._n_updates += 1
+
+                logs["critic_loss"].append(loss)
+                logs["q_mean"].append(q_values.mean())
+                logs["q_std"].append(q_values.std(dim=0, correction=0).mean())
+                logs["target_q_mean"].append(target.mean())
+
+            if self._n_updates % self.policy_delay == 0:
+                self._update_actor(batches[-1], logs)
+
+    def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
+        """One step of the actor toward the combined critics."""
+        q_values = combine(self.critic(batch.observations, self.actor(batch.observations)), self.target_mode, self.min_mix)
+        actor_loss = -ACTOR_LOSSES[self.actor_loss](q_values, self.baseline)
+        self.actor.optimizer.zero_grad()
+        actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
+        self.actor.optimizer.step()
+
+        value = q_values.detach().mean()
+        logs["actor_loss"].append(actor_loss.detach())
+        logs["advantage"].append(value - self.baseline)
+        self.baseline.copy_(value)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.warmup_policy == "actor" and self.num_timesteps < learning_starts:
+            if self._redraw_actor:
+                self.actor.redraw()
+                self._redraw_actor = False
+            learning_starts = 0  # the actor acts, with noise
+        return super()._sample_action(learning_starts, action_noise, n_envs)
+
+    def _store_transition(self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, *args: Any) -> None:
+        super()._store_transition(replay_buffer, buffer_action, *args)
+        dones = args[2]
+        if dones.any():
+            self._redraw_actor = True
+            if self.num_timesteps > self.learning_starts:
+                self._new_episodes += int(dones.sum())
+
+    def learn(
+        self: SelfSymphony,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "Symphony",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfSymphony:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return state_dicts, [*tensors, "baseline"]
