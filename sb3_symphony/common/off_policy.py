@@ -16,7 +16,7 @@ from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuff
 from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CRITIC_LOSSES
-from sb3_symphony.common.regression import CriticRegression
+from sb3_symphony.common.regression import make_regression
 
 N_STEP_BUFFERS = (NStepReplayBuffer, FadingReplayBuffer, FadingDictReplayBuffer, PrioritizedReplayBuffer)
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
@@ -112,7 +112,8 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         super()._setup_model()
         self.n_steps = n_steps
         self._create_aliases()
-        self._regression = CriticRegression(self.critic, self.critic_target, self.critic_loss, self.critic_reduction)
+        engine = self.policy.critic_engine
+        self._regression = make_regression(self.critic, self.critic_target, self.critic_loss, self.critic_reduction, engine)
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor

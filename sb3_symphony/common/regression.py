@@ -1,13 +1,23 @@
-"""Critic regression: one step of all critics toward a given target."""
+"""
+Critic regression: one step of all critics toward a given target.
+
+The only place with two implementations: plain autograd, for any network and optimiser, and a fused one for plain MLPs
+with Adam. They compute the same numbers up to rounding, on the same parameters and optimiser state.
+"""
 
 from typing import NamedTuple
 
 import torch as th
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
+from torch.optim.adam import adam
 
 from sb3_symphony.common.ensembles import EnsembleCritic
+from sb3_symphony.common.fused import FusedNetwork, uncovered
 from sb3_symphony.common.losses import CRITIC_LOSSES
+
+ENGINES = ("auto", "autograd", "fused")
 
 
 class Fit(NamedTuple):
@@ -53,8 +63,7 @@ class CriticRegression:
         :return: The loss and the critics' values before the step
         """
         q_values = self.critic(observations, actions)  # (n_critics, batch, 1)
-        estimate = q_values if self.reduction == "independent" else q_values.mean(dim=0, keepdim=True)
-        loss = self.loss(target - estimate, weights).sum()
+        loss = self._loss(q_values, target, weights)
 
         self.critic.optimizer.zero_grad()
         loss.backward()
@@ -63,3 +72,106 @@ class CriticRegression:
         polyak_update(self.critic.parameters(), self.critic_target.parameters(), tau)
         polyak_update(self.running_stats, self.running_stats_target, 1.0)
         return Fit(loss.detach(), q_values.detach())
+
+    def _loss(self, q_values: th.Tensor, target: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+        estimate = q_values if self.reduction == "independent" else q_values.mean(dim=0, keepdim=True)
+        return self.loss(target - estimate, weights).sum()
+
+
+class FusedRegression(CriticRegression):
+    """The same by hand-written passes on workspaces kept between calls, with torch's fused Adam."""
+
+    network: FusedNetwork | None = None
+
+    def fit(
+        self,
+        observations: PyTorchObs,
+        actions: th.Tensor,
+        target: th.Tensor,
+        tau: float,
+        weights: th.Tensor | None = None,
+    ) -> Fit:
+        if self.network is None or len(self.network.input) != len(actions) or self.network.input.device != actions.device:
+            self.network = FusedNetwork(self.critic.q_networks, len(actions))
+        with th.no_grad():
+            features = self.critic.extract_features(observations, self.critic.features_extractor)
+            q_values = self.network.forward(features, actions)
+
+        # The gradient with respect to the values, (n_critics, batch, 1), is left to autograd: any loss works
+        leaf = q_values.clone().requires_grad_()
+        loss = self._loss(leaf, target, weights)
+        (grad,) = th.autograd.grad(loss, leaf)
+
+        with th.no_grad():
+            self.network.backward(grad)
+            self._optimizer_step(self.network)
+            th._foreach_lerp_(list(self.critic_target.q_networks.parameters()), self.network.parameters, tau)
+        return Fit(loss.detach(), leaf.detach())
+
+    def _optimizer_step(self, network: FusedNetwork) -> None:
+        optimizer = self.critic.optimizer
+        group = optimizer.param_groups[0]
+        for parameter in network.parameters:
+            if not optimizer.state[parameter]:  # as Adam itself does at its first step
+                step = th.zeros((), dtype=th.float32)
+                optimizer.state[parameter] = dict(
+                    step=step, exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter)
+                )
+        states = [optimizer.state[parameter] for parameter in network.parameters]
+        on_cpu = network.input.device.type == "cpu"
+        adam(
+            network.parameters,  # type: ignore[arg-type]
+            network.grads,
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
+            [],
+            [state["step"] for state in states],
+            fused=on_cpu,
+            foreach=not on_cpu,  # a fused step on CUDA would need the step counts there: not what Adam saves by default
+            amsgrad=False,
+            maximize=False,
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            lr=group["lr"],
+            weight_decay=group["weight_decay"],
+            eps=group["eps"],
+            decoupled_weight_decay=isinstance(optimizer, th.optim.AdamW),
+        )
+
+
+def not_fusable(critic: EnsembleCritic) -> str | None:
+    """
+    Why critics cannot be fitted by :class:`FusedRegression`.
+
+    :param critic: The critics
+    :return: A reason, or ``None`` if they can
+    """
+    optimizer = critic.optimizer
+    if type(critic.features_extractor) is not FlattenExtractor:
+        return f"the features extractor is {type(critic.features_extractor).__name__}, not FlattenExtractor"
+    if (layer := uncovered(critic.q_networks)) is not None:
+        return f"no hand-written passes for {layer}"
+    if type(optimizer) not in (th.optim.Adam, th.optim.AdamW):
+        return f"the optimizer is {type(optimizer).__name__}, not Adam or AdamW"
+    special = [name for name in ("amsgrad", "maximize", "capturable", "differentiable") if optimizer.defaults.get(name)]
+    return f"the optimizer has {special[0]}=True" if special else None
+
+
+def make_regression(
+    critic: EnsembleCritic, critic_target: EnsembleCritic, loss: str, reduction: str, engine: str = "auto"
+) -> CriticRegression:
+    """
+    The regression of given critics.
+
+    :param critic: The critics, with their optimiser
+    :param critic_target: Their targets
+    :param loss: Error function by name
+    :param reduction: ``"independent"`` or ``"ensemble_mean"``
+    :param engine: ``"auto"`` (fused if possible), ``"autograd"`` or ``"fused"``
+    :raises ValueError: if ``engine="fused"`` cannot be, saying why
+    """
+    reason = not_fusable(critic)
+    if engine == "fused" and reason is not None:
+        raise ValueError(f"critic_engine='fused' is not possible: {reason}; expected critic_engine='auto' or 'autograd'")
+    chosen = CriticRegression if engine == "autograd" or reason is not None else FusedRegression
+    return chosen(critic, critic_target, loss, reduction)

@@ -8,7 +8,9 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from sb3_symphony.common.checks import check_choice
 from sb3_symphony.common.ensembles import EnsembleCritic
+from sb3_symphony.common.regression import ENGINES
 
 
 def xavier_(module: nn.Module) -> None:
@@ -40,6 +42,8 @@ class REDQPolicy(SACPolicy):
     :param share_features_extractor: Whether to share or not the features extractor between the actor and the critics
     :param layer_norm: Whether the critics normalise each hidden layer before its activation
     :param dropout_rate: Dropout after the critics' hidden linear layers, active in the targets too (DroQ)
+    :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
+        fused wherever it is possible. The results are equal up to rounding
     """
 
     critic: EnsembleCritic  # type: ignore[assignment]
@@ -65,7 +69,10 @@ class REDQPolicy(SACPolicy):
         share_features_extractor: bool = False,
         layer_norm: bool | Sequence[bool] = False,
         dropout_rate: float = 0.0,
+        critic_engine: str = "auto",
     ) -> None:
+        check_choice("critic_engine", critic_engine, ENGINES)
+        self.critic_engine = critic_engine
         self.layer_norm, self.dropout_rate = layer_norm, dropout_rate  # before the parent, which builds the networks
         super().__init__(
             observation_space,
@@ -95,9 +102,9 @@ class REDQPolicy(SACPolicy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return EnsembleCritic(
-            **critic_kwargs, layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, init="xavier"
-        ).to(self.device)
+        return EnsembleCritic(**critic_kwargs, layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, init="xavier").to(
+            self.device
+        )
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
@@ -106,7 +113,7 @@ class REDQPolicy(SACPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate)
+        data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, critic_engine=self.critic_engine)
         return data
 
 

@@ -10,8 +10,10 @@ from stable_baselines3.td3.policies import Actor as TD3Actor
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
+from sb3_symphony.common.checks import check_choice
 from sb3_symphony.common.ensembles import EnsembleCritic, hidden_layers, mlp
 from sb3_symphony.common.layers import LeakySine
+from sb3_symphony.common.regression import ENGINES
 
 Activations = type[nn.Module] | Sequence[type[nn.Module]]
 LayerNorms = bool | Sequence[bool]
@@ -85,6 +87,8 @@ class SymphonyPolicy(TD3Policy):
     :param layer_norm: LayerNorm before the activation(s)
     :param dropout_rate: Dropout after the critics' hidden linear layers, active in the targets too
     :param leaky_slope: Slope of the ``LeakySine`` activations
+    :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
+        fused wherever it is possible. The results are equal up to rounding
     """
 
     actor: Actor
@@ -108,7 +112,10 @@ class SymphonyPolicy(TD3Policy):
         layer_norm: LayerNorms | dict[str, LayerNorms] = (True, False),
         dropout_rate: float = 0.0,
         leaky_slope: float = 0.1,
+        critic_engine: str = "auto",
     ) -> None:
+        check_choice("critic_engine", critic_engine, ENGINES)
+        self.critic_engine = critic_engine
         self.layer_norm, self.dropout_rate, self.leaky_slope = layer_norm, dropout_rate, leaky_slope  # used by the parent
         super().__init__(
             observation_space,
@@ -165,6 +172,7 @@ class SymphonyPolicy(TD3Policy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, leaky_slope=self.leaky_slope)
+        data.update(critic_engine=self.critic_engine)
         return data
 
 
