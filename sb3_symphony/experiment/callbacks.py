@@ -1,0 +1,135 @@
+"""What happens beside learning: evaluation, stopping on a signal, progress bar."""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, ProgressBarCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+
+class StopOnSignal(BaseCallback):
+    """
+    Ends training after the current step when Ctrl-C is pressed or the process is asked to terminate.
+
+    Stopping between two steps leaves model, replay and files whole. A second signal does not wait.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.requested = False
+
+    def _handle(self, signum: int, frame: Any) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+        # Not print(): a signal may arrive inside one
+        os.write(2, b"\nstopping after this step and saving the model (once more: at once)\n")
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Handle signals inside the block, where Python allows it (the main thread)."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _on_step(self) -> bool:
+        return not self.requested
+
+
+class _EvaluationAborted(Exception):
+    pass
+
+
+class SaveNormalization(BaseCallback):
+    """
+    Saves the statistics of ``VecNormalize`` beside a new best model.
+
+    :param path: file
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def _on_step(self) -> bool:
+        normalization = self.model.get_vec_normalize_env()
+        if normalization is not None:
+            normalization.save(str(self.path))
+        return True
+
+
+class SeededEvaluation(EvalCallback):
+    """
+    SB3's evaluation, on the same environment seeds every time, and abandoned when the run is to stop.
+
+    :param eval_env: environment of :func:`sb3_symphony.experiment.environment.make_evaluation_env`
+    :param stop: tells whether to stop
+    :param kwargs: arguments of ``EvalCallback``
+    """
+
+    def __init__(self, eval_env: VecEnv, stop: StopOnSignal, **kwargs: Any) -> None:
+        super().__init__(eval_env, **kwargs)
+        self.stop = stop
+
+    def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+        if self.stop.requested:
+            raise _EvaluationAborted
+        super()._log_success_callback(locals_, globals_)
+
+    def _on_step(self) -> bool:
+        if self.eval_freq > 0 and self.n_calls % self.eval_freq == 0:
+            self.eval_env.env_method("restart_seeds")
+        try:
+            return super()._on_step()
+        except _EvaluationAborted:
+            return False
+
+
+class ReturnProgressBar(ProgressBarCallback):
+    """
+    Progress bar that shows the mean return of the latest training episodes and the last evaluation.
+
+    :param evaluation: evaluation of the run, if there is one
+    """
+
+    def __init__(self, evaluation: EvalCallback | None = None) -> None:
+        super().__init__()
+        self.evaluation = evaluation
+        self._open = False
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._open = True
+
+    def _on_step(self) -> bool:
+        finished = any("episode" in info for info in self.locals["infos"])
+        evaluated = self.evaluation is not None and self.evaluation.evaluations_results
+        if finished and self.model.ep_info_buffer:
+            latest = [episode["r"] for episode in self.model.ep_info_buffer][-10:]
+            description = f"return {np.mean(latest):.0f}"
+            if evaluated:
+                assert self.evaluation is not None
+                description += f", evaluated {np.mean(self.evaluation.evaluations_results[-1]):.0f}"
+            self.pbar.set_description(description, refresh=False)
+        return super()._on_step()
+
+    def close(self) -> None:
+        """Leave the terminal in order, also after an error."""
+        if self._open:
+            self._open = False
+            super()._on_training_end()
+
+    def _on_training_end(self) -> None:
+        self.close()

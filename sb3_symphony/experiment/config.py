@@ -1,0 +1,352 @@
+"""
+What a run is made of: options of the command line, YAML read safely, and the merged, validated settings.
+
+No string is ever evaluated and no YAML tag builds an object, so a configuration from a stranger is harmless. Whatever
+is wrong in it ends in one :class:`ConfigError` with the key, the value and what was expected. The keys that belong to
+the algorithm's constructor are checked in :mod:`sb3_symphony.experiment.decode`; this module imports neither torch nor
+Stable-Baselines3.
+"""
+
+import ast
+import re
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
+
+from sb3_symphony.experiment.registry import ALGORITHMS, suggestion
+
+
+class ConfigError(ValueError):
+    """A user's mistake, told in one line."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Reading
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 without objects, and with ``1e-3`` and ``1e6`` as numbers (PyYAML wants a dot in them)."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d[\d_]*(\.[\d_]*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
+
+
+def parse_yaml(text: str, origin: str) -> Any:
+    """
+    Read YAML made of plain values.
+
+    :param text: YAML
+    :param origin: where it comes from, for messages
+    :return: mappings, lists, text, numbers, true/false, null
+    :raises ConfigError: if it is damaged or holds tags that build objects
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        if isinstance(error, yaml.constructor.ConstructorError) and "constructor for the tag" in str(error.problem):
+            tag = str(error.problem).rpartition("tag ")[2].strip("'").replace("tag:yaml.org,2002:", "!!")
+            raise ConfigError(f"{origin}{line}: tag '{tag}' refused — expected plain values and class names") from None
+        raise ConfigError(f"{origin}{line}: not valid YAML — {error.problem or error.context}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{origin}: not valid YAML — {error}") from None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """
+    Read a YAML file that holds a mapping.
+
+    :param path: the file
+    :return: the mapping
+    :raises ConfigError: if it cannot be read, is damaged, or is something else
+    """
+    try:
+        content = parse_yaml(path.read_text(encoding="utf-8"), str(path))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file — expected a YAML file of hyper-parameters") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read — {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file — expected a YAML file of hyper-parameters") from None
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise ConfigError(f"{path}: expected a mapping of names to values")
+    return content
+
+
+def parse_pairs(pairs: list[str], flag: str) -> dict[str, Any]:
+    """
+    Read the ``key:value`` pairs of a flag; values are YAML (``learning_rate:1e-3 policy_kwargs:"{net_arch: [64]}"``).
+
+    :param pairs: as given on the command line
+    :param flag: the flag, for messages
+    :return: keys and plain values
+    """
+    values = {}
+    for pair in pairs:
+        key, colon, value = pair.partition(":")
+        if not (key and colon):
+            raise ConfigError(f"{flag}: '{pair}' — expected key:value, such as learning_rate:1e-3")
+        values[key.strip()] = parse_yaml(value, f"{flag} {key}")
+    return values
+
+
+def _plain_expression(node: ast.AST, text: str) -> Any:
+    match node:
+        case ast.Constant(value=value) if value is None or isinstance(value, bool | int | float | str):
+            return value
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=value)) if isinstance(value, int | float):
+            return -value
+        case ast.List(elts=elements) | ast.Tuple(elts=elements):
+            return [_plain_expression(element, text) for element in elements]
+        case ast.Dict(keys=keys, values=values) if None not in keys:
+            return {
+                _plain_expression(key, text): _plain_expression(v, text) for key, v in zip(keys, values, strict=True) if key
+            }
+        case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(word.arg for word in keywords):
+            return {str(word.arg): _plain_expression(word.value, text) for word in keywords}
+        case ast.Name() | ast.Attribute():
+            return ast.unparse(node)  # a class name, looked up in an allow-list later
+    raise ConfigError(f"'{text}' — expected a mapping, or dict(...) of plain values and class names")
+
+
+def parse_expression(text: str) -> Any:
+    """
+    Read the notation of RL Zoo files, ``"dict(net_arch=[64, 64], activation_fn=nn.ReLU)"``, without evaluating it.
+
+    :param text: the expression
+    :return: plain values; class names stay names
+    :raises ConfigError: for anything but literals, ``dict(...)`` and names
+    """
+    try:
+        return _plain_expression(ast.parse(text.strip(), mode="eval").body, text)
+    except (SyntaxError, ValueError, TypeError, RecursionError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"'{text}' — expected a mapping, or dict(...) of plain values and class names") from None
+
+
+def shipped_folder() -> Path:
+    """
+    :return: folder of the YAML files that come with the package: inside it when installed, beside it in a checkout
+    """
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "hyperparams"
+    return installed if installed.is_dir() else package.parent / "hyperparams"
+
+
+def shipped_environments(algo: str) -> list[str]:
+    """
+    :param algo: name of an algorithm
+    :return: environments that have an entry in its shipped file
+    """
+    return [env for env in read_yaml(shipped_folder() / f"{algo}.yml") if env != "default"]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Options of the command line
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+class TrainOptions(BaseModel):
+    """Options of ``sb3-symphony train``; their meaning is in its ``--help``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    algo: str = "symphony"
+    env: str = "BipedalWalker-v3"
+    n_timesteps: int = Field(-1, ge=-1)
+    seed: int = Field(-1, ge=-1, lt=2**31)
+    log_folder: str = "logs"
+    eval_freq: int = 10_000
+    eval_episodes: int = Field(10, ge=1)
+    hyperparams: dict[str, Any] = {}
+    conf_file: str | None = None
+    env_kwargs: dict[str, Any] = {}
+    tensorboard_log: str = ""
+    save_freq: int = -1
+    device: str = "auto"
+    num_threads: int = -1
+    log_interval: int = Field(-1, ge=-2)
+    verbose: int | None = Field(None, ge=0, le=2)
+    progress: bool | None = None
+
+    @field_validator("n_timesteps")
+    @classmethod
+    def _some_steps(cls, value: int) -> int:
+        if value == 0:
+            raise ValueError("expected a whole number greater than 0")
+        return value
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Settings of a run
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _wrapper_list(value: Any) -> Any:
+    """Zoo's forms of ``env_wrapper`` (name, {name: arguments}, a list of both) as one list of (name, arguments)."""
+    if value is None:
+        return []
+    items = []
+    for item in value if isinstance(value, list) else [value]:
+        if isinstance(item, str):
+            items.append((item, {}))
+        elif isinstance(item, dict) and all(isinstance(v, dict | None) for v in item.values()):
+            items += [(name, arguments or {}) for name, arguments in item.items()]
+        else:
+            raise ValueError("expected a dotted name, {name: {argument: value}}, or a list of these")
+    return items
+
+
+def _no_boolean(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("expected a whole number")
+    return value
+
+
+_Count = Annotated[int, BeforeValidator(_no_boolean), Field(ge=1)]
+
+
+class RunSettings(BaseModel):
+    """
+    Keys of a configuration that are about the run; all others belong to the algorithm's constructor.
+
+    :param n_timesteps: length of the training, in environment steps
+    :param policy: name of a policy of the algorithm, such as ``MlpPolicy``
+    :param n_envs: number of parallel environments
+    :param normalize: ``VecNormalize`` with its defaults, or its arguments
+    :param env_wrapper: dotted names of wrappers and their arguments, from the inside out
+    :param env_kwargs: arguments of the environment
+    :param noise_type: exploration noise of Stable-Baselines3, by Zoo's names
+    :param noise_std: its standard deviation, in scaled action units
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    n_timesteps: _Count
+    policy: str = "MlpPolicy"
+    n_envs: _Count = 1
+    normalize: bool | dict[str, Any] = False
+    env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_wrapper_list)] = []
+    env_kwargs: dict[str, Any] = {}
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
+    noise_std: Annotated[FiniteFloat, Field(ge=0)] | None = None
+
+
+@dataclass
+class RunConfig:
+    """
+    A merged configuration.
+
+    :param settings: what concerns the run
+    :param arguments: the algorithm's own keys, as plain values
+    :param plain: everything as plain values, which ``config.yml`` holds and ``-conf`` reads back
+    """
+
+    settings: RunSettings
+    arguments: dict[str, Any]
+    plain: dict[str, Any]
+
+
+def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
+    """
+    :param model: a pydantic model
+    :param values: its fields
+    :return: the model's instance
+    :raises ConfigError: with the first field that is wrong
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = str(first["loc"][0]) if first["loc"] else model.__name__
+        if first["type"] == "missing":
+            raise ConfigError(f"{key}: missing — expected in the configuration") from None
+        if first["type"] == "extra_forbidden":
+            raise ConfigError(f"unknown option '{key}'{suggestion(key, model.model_fields)}") from None
+        message = first["msg"].removeprefix("Value error, ").replace("Input should be", "expected", 1)
+        message = message.replace("a valid integer", "a whole number").replace("a valid ", "a ")
+        raise ConfigError(f"{key}: {values.get(key)!r} — {message}") from None
+
+
+def check_algorithm(name: str) -> None:
+    """
+    :param name: name of an algorithm
+    :raises ConfigError: if there is none of that name
+    """
+    if name not in ALGORITHMS:
+        near = suggestion(name, ALGORITHMS) or f" — expected one of {', '.join(ALGORITHMS)}"
+        raise ConfigError(f"unknown algorithm '{name}'{near}")
+
+
+def _entry(options: TrainOptions) -> dict[str, Any]:
+    """The entry of the environment, else ``default``, in the given file or the shipped one; a flat file is its own entry."""
+    path = Path(options.conf_file) if options.conf_file else shipped_folder() / f"{options.algo}.yml"
+    content = read_yaml(path)
+    for name in (options.env, "default"):
+        if name in content:
+            if not isinstance(content[name], dict):
+                raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")
+            return deepcopy(content[name])
+    if content and all(isinstance(value, dict) and "n_timesteps" in value for value in content.values()):
+        raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
+    return content
+
+
+def _override(plain: dict[str, Any], key: str, value: Any) -> None:
+    """``policy_kwargs.net_arch`` changes one item of a mapping, ``policy_kwargs`` replaces all of it."""
+    *parents, last = key.split(".")
+    for parent in parents:
+        plain = plain.setdefault(parent, {})
+        if not isinstance(plain, dict):
+            raise ConfigError(f"-params: '{key}' — '{parent}' is not a mapping")
+    plain[last] = value
+
+
+def load_config(options: TrainOptions) -> RunConfig:
+    """
+    Merge the shipped entry (or the given file instead of it) with the command line, later ones winning.
+
+    :param options: options of the command line
+    :return: the configuration, of which the algorithm's keys are yet to be checked
+    :raises ConfigError: if a file or a key of the run is wrong
+    """
+    check_algorithm(options.algo)
+    plain = _entry(options)
+    mappings = ("policy_kwargs", "replay_buffer_kwargs", "env_kwargs", "normalize")
+
+    def read_expressions() -> None:
+        for key in mappings:
+            if isinstance(plain.get(key), str):
+                try:
+                    plain[key] = parse_expression(plain[key])
+                except ConfigError as error:
+                    raise ConfigError(f"{key}: {error}") from None
+
+    read_expressions()  # before, so that items of them can be overridden
+    for key, value in options.hyperparams.items():
+        _override(plain, key, value)
+    read_expressions()
+    if options.n_timesteps > 0:
+        plain["n_timesteps"] = options.n_timesteps
+    if options.env_kwargs:
+        plain["env_kwargs"] = {**(plain.get("env_kwargs") or {}), **options.env_kwargs}
+    plain = {key: value for key, value in plain.items() if not (value is None and key in RunSettings.model_fields)}
+
+    settings = validated(RunSettings, {key: value for key, value in plain.items() if key in RunSettings.model_fields})
+    if (settings.noise_type is None) != (settings.noise_std is None):
+        raise ConfigError("noise_type and noise_std: expected both or neither")
+    plain["n_timesteps"] = settings.n_timesteps
+    arguments = {key: value for key, value in plain.items() if key not in RunSettings.model_fields}
+    return RunConfig(settings, arguments, plain)

@@ -1,0 +1,324 @@
+"""
+Plain values of a configuration → arguments of an algorithm, checked against the signatures of the classes themselves.
+
+Classes are found by name in allow-lists, never by evaluating text.
+"""
+
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import gymnasium as gym
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_symphony.experiment.config import ConfigError, RunConfig, RunSettings
+from sb3_symphony.experiment.registry import suggestion
+
+_SB3 = "stable_baselines3.common"
+_OURS = "sb3_symphony.common"
+_BUFFERS = {
+    f"{_SB3}.buffers": ("ReplayBuffer", "DictReplayBuffer", "NStepReplayBuffer", "RolloutBuffer", "DictRolloutBuffer"),
+    "stable_baselines3.her.her_replay_buffer": ("HerReplayBuffer",),
+    f"{_OURS}.buffers": ("FadingReplayBuffer", "FadingDictReplayBuffer", "PrioritizedReplayBuffer"),
+}
+_EXTRACTORS = {f"{_SB3}.torch_layers": ("FlattenExtractor", "NatureCNN", "CombinedExtractor")}
+#: key → module → classes that it may name
+_CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
+    "activation_fn": {
+        "torch.nn": ("ReLU", "ELU", "Tanh", "LeakyReLU", "SiLU", "GELU", "Identity"),
+        f"{_OURS}.layers": ("LeakySine",),
+    },
+    "optimizer_class": {
+        "torch.optim": ("Adam", "AdamW", "Adamax", "NAdam", "RAdam", "RMSprop", "SGD"),
+        f"{_SB3}.sb2_compat.rmsprop_tf_like": ("RMSpropTFLike",),
+    },
+    "replay_buffer_class": _BUFFERS,
+    "rollout_buffer_class": _BUFFERS,
+    "features_extractor_class": _EXTRACTORS,
+    "action_noise": {
+        f"{_SB3}.noise": ("NormalActionNoise", "OrnsteinUhlenbeckActionNoise"),
+        f"{_OURS}.noise": ("DecayingNormalActionNoise", "StickyActionNoise", "PinkActionNoise", "DisturbanceActionNoise"),
+    },
+}
+
+#: set by the command line
+_RESERVED = {"self", "env", "policy", "verbose", "seed", "device", "tensorboard_log", "_init_setup_model"}
+#: given by the algorithm to its policy
+_POLICY_RESERVED = {"self", "observation_space", "action_space", "lr_schedule", "use_sde"}
+
+_AT_LEAST_ONE = {
+    "batch_size",
+    "buffer_size",
+    "cg_max_steps",
+    "hold",
+    "n_critics",
+    "n_epochs",
+    "n_quantiles",
+    "n_steps",
+    "policy_delay",
+    "stats_window_size",
+    "subset_size",
+    "target_update_interval",
+    "train_freq",
+}
+_FRACTION = {"dropout_rate", "gae_lambda", "gamma", "min_mix", "tau"}
+_ANY_SIGN = {"gradient_steps", "sde_sample_freq", "target_entropy"}
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Names and signatures
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def class_by_name(key: str, name: Any) -> Any:
+    """
+    :param key: the key whose value names a class, such as ``activation_fn``
+    :param name: name of the class, short (``ReLU``) or with its module (``nn.ReLU``, ``torch.nn.ReLU``)
+    :return: the class
+    :raises ConfigError: if the name is not in the key's allow-list
+    """
+    known = {f"{module}.{short}": (module, short) for module, shorts in _CLASSES[key].items() for short in shorts}
+    if isinstance(name, str):
+        for full, (module, short) in known.items():
+            if f".{full}".endswith("." + name.replace("th.", "torch.") if name.startswith("th.") else "." + name):
+                return getattr(import_module(module), short)
+    shorts = [short for _, short in known.values()]
+    near = suggestion(str(name).rpartition(".")[2], shorts) or f" — expected one of {', '.join(shorts)}"
+    raise ConfigError(f"{key}: unknown class {name!r}{near}")
+
+
+def argument_types(class_: type) -> dict[str, Any]:
+    """
+    :param class_: any class
+    :return: arguments of its constructor with their annotations, parents' included where it takes ``**kwargs``
+    """
+    found: dict[str, Any] = {}
+    for parent in class_.__mro__:
+        if "__init__" not in vars(parent):
+            continue
+        init = vars(parent)["__init__"]
+        try:
+            hints = get_type_hints(init)
+        except NameError:  # a name imported for type checkers only
+            hints = {}
+        parameters = inspect.signature(init).parameters.values()
+        for parameter in parameters:
+            if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+                found.setdefault(parameter.name, hints.get(parameter.name, Any))
+        if all(parameter.kind != parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return found
+
+
+def check_keys(given: Iterable[str], known: Iterable[str], what: str, owner: str) -> None:
+    """
+    :param given: keys of the configuration
+    :param known: valid keys
+    :param what: what a key is called in the message
+    :param owner: what it would belong to
+    :raises ConfigError: for the first unknown key, with the nearest valid one
+    """
+    known = set(known)
+    for key in given:
+        if key not in known:
+            raise ConfigError(f"unknown {what} '{key}' for {owner}{suggestion(str(key), known)}")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Values
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
+    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+
+
+def _describe(annotation: Any) -> str:
+    """What an annotation allows, in words."""
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a name", NoneType: "null"}
+    parts = []
+    alternatives = _alternatives(annotation)
+    for alternative in alternatives:
+        origin = get_origin(alternative)
+        if alternative in words:
+            if not (alternative is int and float in alternatives):
+                parts.append(words[alternative])
+        elif origin is Callable or get_origin(alternative) is get_origin(Callable[[], None]):
+            parts.append("lin_<number>")
+        elif origin is Literal:
+            parts += [repr(choice) for choice in get_args(alternative)]
+        elif origin is tuple:
+            parts.append(f"[{', '.join(_describe(item) for item in get_args(alternative))}]")
+        elif origin is dict:
+            parts.append("a mapping")
+        elif origin is type:
+            parts.append("the name of a class")
+        elif origin is list:
+            parts.append("a list")
+        elif isinstance(alternative, type):
+            parts.append(f"{{{alternative.__name__}: {{…}}}}")
+    return " or ".join(dict.fromkeys(parts))
+
+
+def _numbers(value: Any) -> Iterable[float]:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        yield value
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _numbers(item)
+    elif isinstance(value, LinearSchedule):
+        yield value.start
+
+
+def _check_range(key: str, plain: Any, value: Any, lowest: float) -> None:
+    """Numbers are finite; a name that means a count or a fraction has that range; else they are at least ``lowest``."""
+    for number in _numbers(value):
+        if not math.isfinite(number):
+            raise ConfigError(f"{key}: {plain!r} — expected a finite number")
+        if key in _AT_LEAST_ONE or key == "net_arch":
+            if number < 1:
+                raise ConfigError(f"{key}: {plain!r} — expected a number >= 1")
+        elif key in _FRACTION:
+            if not 0 <= number <= 1:
+                raise ConfigError(f"{key}: {plain!r} — expected a number in [0, 1]")
+        elif key not in _ANY_SIGN and number < lowest:
+            raise ConfigError(f"{key}: {plain!r} — expected a number >= {lowest:g}")
+
+
+def _typed(key: str, plain: Any, value: Any, annotation: Any, lowest: float) -> Any:
+    """The value as its annotation wants it (``1e6`` → 1000000, list → tuple), or an error that says what it wants."""
+    expected = ConfigError(f"{key}: {plain!r} — expected {_describe(annotation)}")
+    if isinstance(value, bool) and annotation is not Any and bool not in _alternatives(annotation):
+        raise expected  # else taken for 0 or 1
+    try:
+        adapter: TypeAdapter = TypeAdapter(annotation, config=ConfigDict(arbitrary_types_allowed=True))
+        value = adapter.validate_python(value)
+    except ValidationError:
+        raise expected from None
+    _check_range(key, plain, value, lowest)
+    return value
+
+
+def _schedule(key: str, value: Any) -> Any:
+    """``lin_<v>``: from v at the start to 0 at the end."""
+    if isinstance(value, str) and value.startswith("lin_"):
+        try:
+            return LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
+        except ValueError:
+            raise ConfigError(f"{key}: {value!r} — expected a number or lin_<number>") from None
+    return value
+
+
+def _takes_schedule(annotation: Any) -> bool:
+    return any(get_origin(item) is get_origin(Callable[[], None]) for item in _alternatives(annotation))
+
+
+def _named_classes(key: str, value: Any) -> Any:
+    """Names → classes, also in lists and mappings (one activation per layer, or per network)."""
+    if isinstance(value, Mapping):
+        return {name: _named_classes(key, item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_named_classes(key, item) for item in value]
+    return class_by_name(key, value)
+
+
+def _action_noise(value: Any, n_actions: int, n_envs: int) -> Any:
+    """``{StickyActionNoise: {sigma: 0.3}}`` → that noise for this action space."""
+    name, arguments = next(iter(value.items())) if isinstance(value, dict) and len(value) == 1 else (value, {})
+    arguments = {} if arguments is None else arguments
+    if not (isinstance(name, str) and isinstance(arguments, dict)):
+        raise ConfigError(f"action_noise: {value!r} — expected {{NameOfTheNoise: {{sigma: 0.3}}}}")
+    class_ = class_by_name("action_noise", name)
+    types = argument_types(class_)
+    filled = {"n_actions": n_actions, "n_envs": n_envs}
+    check_keys(arguments, types.keys() - {"self", *filled}, "argument", name)
+    _check_range("action_noise", value, {k: v for k, v in arguments.items() if k != "mean"}, 0)
+    if "n_actions" not in types:  # SB3's own noises want one number per action
+        arguments = {"mean": 0.0, **arguments}
+        arguments = {k: np.full(n_actions, v) if k in ("mean", "sigma") else v for k, v in arguments.items()}
+    arguments |= {key: filled[key] for key in filled if key in types}
+    try:
+        return class_(**arguments)
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"action_noise: {name}: {error}") from None
+
+
+def _policy_kwargs(value: Any, policy_class: type) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError(f"policy_kwargs: {value!r} — expected a mapping")
+    types = argument_types(policy_class)
+    check_keys(value, types.keys() - _POLICY_RESERVED, "policy_kwargs key", policy_class.__name__)
+    decoded = {}
+    for key, plain in value.items():
+        item = _named_classes(key, plain) if key in _CLASSES and plain is not None else plain
+        decoded[key] = _typed(key, plain, item, types[key], -math.inf)
+    return decoded
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The whole
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def algorithm_arguments(
+    name: str, algorithm: type[BaseAlgorithm], config: RunConfig, action_space: gym.Space
+) -> dict[str, Any]:
+    """
+    Decode and check the algorithm's part of a configuration.
+
+    :param name: the algorithm's name on the command line
+    :param algorithm: its class
+    :param config: the merged configuration
+    :param action_space: action space of the environment, which sizes the exploration noise
+    :return: keyword arguments for the constructor, ``policy`` included
+    :raises ConfigError: for an unknown key or a wrong value
+    """
+    types = argument_types(algorithm)
+    for key in config.arguments:
+        if key in _RESERVED:
+            raise ConfigError(f"'{key}' is not a hyper-parameter — it is set on the command line")
+    known = types.keys() - _RESERVED
+    check_keys(config.arguments, known | RunSettings.model_fields.keys(), "hyper-parameter", name)
+    settings = config.settings
+    if settings.policy not in algorithm.policy_aliases:
+        near = suggestion(settings.policy, algorithm.policy_aliases)
+        near = near or f" — expected one of {', '.join(algorithm.policy_aliases)}"
+        raise ConfigError(f"policy: unknown policy '{settings.policy}' for {name}{near}")
+
+    n_actions = int(np.prod(action_space.shape or (1,)))
+    plain_arguments = dict(config.arguments)
+    if settings.noise_type is not None:
+        if "action_noise" not in known or "action_noise" in plain_arguments:
+            raise ConfigError(f"noise_type: {settings.noise_type!r} — {name} takes no noise_type beside its own noise")
+        noise = {"normal": "NormalActionNoise", "ornstein-uhlenbeck": "OrnsteinUhlenbeckActionNoise"}[settings.noise_type]
+        plain_arguments["action_noise"] = {noise: {"sigma": settings.noise_std}}
+
+    decoded: dict[str, Any] = {}
+    for key, plain in plain_arguments.items():
+        value = plain
+        if value is None:
+            pass
+        elif key == "policy_kwargs":
+            decoded[key] = _policy_kwargs(value, algorithm.policy_aliases[settings.policy])
+            continue
+        elif key == "action_noise" and not (value == "default" and str in _alternatives(types[key])):
+            value = _action_noise(value, n_actions, settings.n_envs)
+        elif key in _CLASSES and not isinstance(value, ActionNoise) and key != "action_noise":
+            value = _named_classes(key, value)
+        elif _takes_schedule(types[key]):
+            value = _schedule(key, value)
+        decoded[key] = _typed(key, plain, value, types[key], 0)
+    buffer_class, buffer_kwargs = decoded.get("replay_buffer_class"), decoded.get("replay_buffer_kwargs")
+    if buffer_class is not None and buffer_kwargs:
+        check_keys(buffer_kwargs, argument_types(buffer_class), "replay_buffer_kwargs key", buffer_class.__name__)
+    return {"policy": settings.policy, **decoded}

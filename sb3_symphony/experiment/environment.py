@@ -1,0 +1,218 @@
+"""Environments of a run: what is learned from, and what is evaluated."""
+
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env, unwrap_wrapper
+from stable_baselines3.common.monitor import Monitor, ResultsWriter
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
+from sb3_symphony.experiment.config import ConfigError, RunSettings
+from sb3_symphony.experiment.decode import argument_types, check_keys
+from sb3_symphony.experiment.registry import suggestion
+
+#: evaluation episode i runs on environment seed 10 000 + i
+EVALUATION_SEED = 10_000
+
+_WRAPPER_PACKAGES = ("sb3_symphony.", "gymnasium.wrappers.", "stable_baselines3.", "sb3_contrib.")
+_WRITE_FILES = {"Monitor", "RecordVideo"}  # a configuration must not choose what is written where
+_TRAINING_ONLY = (LearningReward, EpisodeStepLimit)
+_ON_POLICY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+
+Wrappers = list[Callable[[gym.Env], gym.Env]]
+
+
+class EpisodeSeeds(gym.Wrapper):
+    """
+    Runs the i-th episode since :meth:`restart_seeds` on environment seed ``first + i``.
+
+    :param env: environment
+    :param first: seed of the first episode
+    """
+
+    def __init__(self, env: gym.Env, first: int = EVALUATION_SEED) -> None:
+        super().__init__(env)
+        self.first = first
+        self.episode = 0
+
+    def restart_seeds(self) -> None:
+        """Let the next episode be the first again."""
+        self.episode = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: ignored
+        :param options: handed to the environment
+        :return: first observation and info
+        """
+        seed = self.first + self.episode
+        self.episode += 1
+        return self.env.reset(seed=seed, options=options)
+
+
+def find_wrapper(name: str) -> type[gym.Wrapper]:
+    """
+    :param name: dotted name of a wrapper, in one of the packages that a configuration may name
+    :return: its class
+    :raises ConfigError: if there is none
+    """
+    if not name.startswith(_WRAPPER_PACKAGES):
+        raise ConfigError(f"env_wrapper: '{name}' — expected a dotted name that starts with {', '.join(_WRAPPER_PACKAGES)}")
+    module_name, _, class_name = name.rpartition(".")
+    try:
+        module = import_module(module_name)
+    except ImportError:
+        raise ConfigError(f"env_wrapper: '{name}' — there is no module '{module_name}'") from None
+    wrappers = [
+        key
+        for key, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, gym.Wrapper) and key not in _WRITE_FILES
+    ]
+    if class_name not in wrappers:
+        raise ConfigError(f"env_wrapper: '{name}' — no such wrapper in {module_name}{suggestion(class_name, wrappers)}")
+    return getattr(module, class_name)
+
+
+def split_wrappers(named: list[tuple[str, dict[str, Any]]]) -> tuple[Wrappers, Wrappers]:
+    """
+    Look up the wrappers of a configuration.
+
+    :param named: dotted names and arguments
+    :return: those that belong to the task, inside ``Monitor`` and in evaluation too; and those for training only,
+        outside it, so that reported returns are the environment's own
+    """
+    task: Wrappers = []
+    training: Wrappers = []
+    for name, arguments in named:
+        class_ = find_wrapper(name)
+        check_keys(arguments, argument_types(class_).keys() - {"self", "env"}, "argument", name)
+        (training if issubclass(class_, _TRAINING_ONLY) else task).append(partial(class_, **arguments))
+    return task, training
+
+
+def _wrapped(env: gym.Env, wrappers: Wrappers) -> gym.Env:
+    for wrapper in wrappers:
+        try:
+            env = wrapper(env)
+        except (ValueError, TypeError, AssertionError) as error:
+            raise ConfigError(f"env_wrapper: {wrapper.func.__name__}: {error}") from None  # type: ignore[attr-defined]
+    return env
+
+
+def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym.Env:
+    """
+    Make one environment; a Box2D one with a fresh world in every episode.
+
+    :param env_id: registered id
+    :param env_kwargs: its arguments
+    :param wrappers: wrappers that belong to the task
+    :return: the environment, without ``Monitor``
+    :raises ConfigError: if there is no such environment, or it cannot be made
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*is out of date")  # papers' figures are for the older versions
+            env = gym.make(env_id, **env_kwargs)
+    except (gym.error.DependencyNotInstalled, ImportError) as error:
+        message = str(error)
+        if "mujoco" in message.lower():
+            message = 'MuJoCo is not installed: pip install "sb3-symphony[mujoco]"'
+        raise ConfigError(f"{env_id}: cannot be made — {message}") from None
+    except gym.error.UnregisteredEnv:
+        near = suggestion(env_id, gym.registry) or " — expected a registered id such as BipedalWalker-v3"
+        raise ConfigError(f"unknown environment '{env_id}'{near}") from None
+    except gym.error.Error as error:
+        raise ConfigError(f"{env_id}: cannot be made — {error}") from None
+    except (TypeError, ValueError, AssertionError, OSError) as error:
+        raise ConfigError(f"{env_id}: cannot be made with {env_kwargs} — {error}") from None
+    if needs_fresh_world(env):
+        env = FreshBox2DWorld(env)
+    return _wrapped(env, wrappers)
+
+
+def check_spaces(env: VecEnv, env_id: str, algo: str) -> None:
+    """
+    :param env: the environment
+    :param env_id: its id
+    :param algo: name of the algorithm
+    :raises ConfigError: if the algorithm cannot act in its action space
+    """
+    space = env.action_space
+    allowed = _ON_POLICY_SPACES if algo in ("ppo", "trpo") else (spaces.Box,)
+    if not isinstance(space, allowed):
+        raise ConfigError(f"{env_id}: its action space is {space} — {algo} needs a continuous one (Box)")
+    if isinstance(space, spaces.Box) and not np.all(np.isfinite([space.low, space.high])):
+        raise ConfigError(f"{env_id}: its action space {space} is unbounded — {algo} needs finite limits")
+
+
+def _normalized(env: VecEnv, settings: RunSettings, gamma: float | None, training: bool) -> VecEnv:
+    if settings.normalize is False:
+        return env
+    arguments = {} if settings.normalize is True else dict(settings.normalize)
+    check_keys(arguments, argument_types(VecNormalize).keys() - {"self", "venv", "training"}, "argument", "normalize")
+    if gamma is not None:
+        arguments.setdefault("gamma", gamma)
+    if not training:
+        arguments["norm_reward"] = False  # evaluations report the environment's own returns
+    try:
+        return VecNormalize(env, training=training, **arguments)
+    except (ValueError, TypeError, AssertionError) as error:
+        raise ConfigError(f"normalize: {error}") from None
+
+
+def make_training_env(env_id: str, settings: RunSettings, gamma: float | None, seed: int) -> VecEnv:
+    """
+    :param env_id: registered id
+    :param settings: settings of the run
+    :param gamma: the algorithm's discount factor, for the normalisation of rewards
+    :param seed: environment ``i`` gets ``seed + i``
+    :return: vectorised environment whose monitors do not write yet (see :func:`attach_monitor_files`)
+    """
+    task, training = split_wrappers(settings.env_wrapper)
+    env = make_vec_env(
+        partial(make_env, env_id, settings.env_kwargs, task),
+        n_envs=settings.n_envs,
+        seed=seed,
+        wrapper_class=partial(_wrapped, wrappers=training),
+    )
+    return _normalized(env, settings, gamma, training=True)
+
+
+def make_evaluation_env(env_id: str, settings: RunSettings) -> VecEnv:
+    """
+    :param env_id: registered id
+    :param settings: settings of the run, of which wrappers for training only are left out
+    :return: vectorised environment with one copy, on the evaluation seeds
+    """
+    task, _ = split_wrappers(settings.env_wrapper)
+
+    def evaluation_env() -> gym.Env:
+        return Monitor(EpisodeSeeds(make_env(env_id, settings.env_kwargs, task)))
+
+    return _normalized(DummyVecEnv([evaluation_env]), settings, None, training=False)
+
+
+def attach_monitor_files(env: VecEnv, folder: Path) -> None:
+    """
+    Let the monitors write ``<i>.monitor.csv``. Separate, since a run folder exists only once everything else is known good.
+
+    :param env: training environment
+    :param folder: run folder
+    """
+    copies = env.unwrapped
+    assert isinstance(copies, DummyVecEnv)
+    for index, copy in enumerate(copies.envs):
+        monitor = unwrap_wrapper(copy, Monitor)
+        assert isinstance(monitor, Monitor)
+        monitor.t_start = time.time()
+        header: dict[str, float | str] = {"t_start": monitor.t_start, "env_id": str(copy.spec.id if copy.spec else None)}
+        monitor.results_writer = ResultsWriter(str(folder / str(index)), header=header)

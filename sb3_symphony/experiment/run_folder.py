@@ -1,0 +1,87 @@
+"""The files of a run, laid out and named as RL Zoo does, so that scripts for its folders work here too."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_symphony.experiment.config import ConfigError
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """
+    ``<log-folder>/<algo>/<env>_<k>/``.
+
+    :param path: the folder
+    :param env_name: the environment's id as it appears in file names
+    """
+
+    path: Path
+    env_name: str
+
+    @classmethod
+    def create(cls, log_folder: str, algo: str, env_id: str) -> "RunFolder":
+        """
+        Make the next free folder; an existing one is never used again, also if two runs start at the same moment.
+
+        :param log_folder: where runs are kept
+        :param algo: name of the algorithm
+        :param env_id: id of the environment
+        :return: the new folder
+        :raises ConfigError: if it cannot be written
+        """
+        env_name = env_id.rpartition(":")[2].replace("/", "-")
+        parent = Path(log_folder) / algo
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            while True:
+                numbers = (re.fullmatch(rf"{re.escape(env_name)}_(\d+)", entry.name) for entry in parent.iterdir())
+                run = cls(parent / f"{env_name}_{1 + max((int(n[1]) for n in numbers if n), default=0)}", env_name)
+                try:
+                    run.path.mkdir()
+                except FileExistsError:
+                    continue
+                run.details.mkdir()
+                return run
+        except OSError as error:
+            raise ConfigError(f"--log-folder: '{log_folder}' cannot be written — {error.strerror}") from None
+
+    @property
+    def details(self) -> Path:
+        """Folder of configuration and statistics."""
+        return self.path / self.env_name
+
+    @property
+    def model(self) -> Path:
+        """The model at the end of the run."""
+        return self.path / f"{self.env_name}.zip"
+
+    @property
+    def normalization(self) -> Path:
+        """Statistics of ``VecNormalize`` that belong to :attr:`model`."""
+        return self.details / "vecnormalize.pkl"
+
+    @property
+    def best_normalization(self) -> Path:
+        """Statistics of ``VecNormalize`` that belong to ``best_model.zip``."""
+        return self.path / "best_model_vecnormalize.pkl"
+
+    @property
+    def plot(self) -> Path:
+        """Curve of returns."""
+        return self.path / "training.png"
+
+    def write_configuration(self, options: dict[str, Any], config: dict[str, Any], command: str) -> None:
+        """
+        Write what the run was started with, as plain YAML.
+
+        :param options: options of the command line
+        :param config: merged hyper-parameters, which ``-conf`` reads back
+        :param command: the command line
+        """
+        (self.details / "args.yml").write_text(yaml.safe_dump(options, sort_keys=False), encoding="utf-8")
+        (self.details / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+        (self.details / "command.txt").write_text(command + "\n", encoding="utf-8")
