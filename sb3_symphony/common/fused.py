@@ -206,7 +206,7 @@ class FusedNetwork:
                 self.operations.append(Sine(module, like))
             elif (passes := in_place(module)) is not None:
                 self.operations.append(InPlace(module, like, *passes))
-        self.parameters = [parameter for operation in self.operations for parameter in operation.parameters]
+        self.parameters: list[th.Tensor] = [parameter for operation in self.operations for parameter in operation.parameters]
         self.grads = [grad for operation in self.operations for grad in operation.grads]
 
     def forward(self, *parts: th.Tensor) -> th.Tensor:

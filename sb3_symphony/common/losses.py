@@ -72,7 +72,7 @@ def rehae_elementwise(q_values: th.Tensor, baseline: th.Tensor) -> th.Tensor:
 
 
 def mean_value(q_values: th.Tensor, baseline: th.Tensor) -> th.Tensor:
-    """The plain deterministic policy gradient's objective, ``mean(q_values)``. Parameters and return value as in :func:`rehae`."""
+    """``mean(q_values)``, the objective of TD3. Parameters and return value as in :func:`rehae`."""
     return q_values.mean()
 
 

@@ -10,12 +10,14 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
 from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CRITIC_LOSSES
+from sb3_symphony.common.noise import DecayingActionNoise
 from sb3_symphony.common.regression import make_regression
 
 N_STEP_BUFFERS = (NStepReplayBuffer, FadingReplayBuffer, FadingDictReplayBuffer, PrioritizedReplayBuffer)
@@ -35,6 +37,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
     :raises TypeError: if an argument has the wrong type
     """
 
+    policy: Any  # SymphonyPolicy or REDQPolicy
     critic: EnsembleCritic
     critic_target: EnsembleCritic
     # Buffers used without ``replay_buffer_class``: for Dict observations, for n-step returns, otherwise
@@ -60,10 +63,9 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         in_policy = policy_kwargs.setdefault("n_critics", n_critics)
         if n_critics not in (default, in_policy):
             raise ValueError(f"n_critics={n_critics!r}, but policy_kwargs has n_critics={in_policy!r}: give one of them")
+        kwargs.update(policy_kwargs=policy_kwargs, supported_action_spaces=(spaces.Box,), support_multi_env=True)
         try:
-            super().__init__(
-                *args, policy_kwargs=policy_kwargs, supported_action_spaces=(spaces.Box,), support_multi_env=True, **kwargs
-            )
+            super().__init__(*args, **kwargs)
         except AssertionError as error:  # SB3 asserts what is a user's error: the kind of the action space
             raise ValueError(str(error)) from error
         self.n_critics = in_policy
@@ -112,8 +114,9 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         super()._setup_model()
         self.n_steps = n_steps
         self._create_aliases()
-        engine = self.policy.critic_engine
-        self._regression = make_regression(self.critic, self.critic_target, self.critic_loss, self.critic_reduction, engine)
+        self._regression = make_regression(
+            self.critic, self.critic_target, self.critic_loss, self.critic_reduction, self.policy.critic_engine
+        )
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -129,7 +132,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         if noise is not None and self.env.num_envs > 1 and not isinstance(noise, VectorizedActionNoise):
             self.action_noise = noise = VectorizedActionNoise(noise, self.env.num_envs)
         for each in noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]:
-            if hasattr(each, "n_envs"):
+            if isinstance(each, DecayingActionNoise):
                 each.n_envs = self.env.num_envs  # a decay counts environment steps
         return super()._setup_learn(*args, **kwargs)
 
@@ -150,8 +153,8 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         :return: Pairs of a segment's transitions and the same as minibatches
         """
         assert self.replay_buffer is not None
-        sizes = [np.prod(space.shape) for space in self._observation_spaces()]
-        updates_per_draw = max(1, int(MAX_SAMPLE_BYTES // (8 * sum(sizes) * batch_size)))
+        row_bytes = 8 * get_flattened_obs_dim(self.observation_space)  # two observations in single precision
+        updates_per_draw = max(1, MAX_SAMPLE_BYTES // (row_bytes * batch_size))
         while gradient_steps > 0:
             draw = min(gradient_steps, updates_per_draw)
             samples = self.replay_buffer.sample(draw * batch_size, env=self._vec_normalize_env, **sample_kwargs)
@@ -162,10 +165,6 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
                 yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
             gradient_steps -= draw
-
-    def _observation_spaces(self) -> list[spaces.Space]:
-        space = self.observation_space
-        return list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
 
     def _update_priorities(self, batch: ReplayBufferSamples, target: th.Tensor, q_values: th.Tensor) -> None:
         """Priority of a transition: its error averaged over the critics. Nothing to do for other buffers."""

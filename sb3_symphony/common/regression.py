@@ -105,7 +105,8 @@ class FusedRegression(CriticRegression):
         with th.no_grad():
             self.network.backward(grad)
             self._optimizer_step(self.network)
-            th._foreach_lerp_(list(self.critic_target.q_networks.parameters()), self.network.parameters, tau)
+            targets: list[th.Tensor] = list(self.critic_target.q_networks.parameters())
+            th._foreach_lerp_(targets, self.network.parameters, tau)
         return Fit(loss.detach(), leaf.detach())
 
     def _optimizer_step(self, network: FusedNetwork) -> None:
@@ -120,7 +121,7 @@ class FusedRegression(CriticRegression):
         states = [optimizer.state[parameter] for parameter in network.parameters]
         on_cpu = network.input.device.type == "cpu"
         adam(
-            network.parameters,  # type: ignore[arg-type]
+            network.parameters,
             network.grads,
             [state["exp_avg"] for state in states],
             [state["exp_avg_sq"] for state in states],

@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -33,7 +33,7 @@ class REDQPolicy(SACPolicy):
     :param log_std_init: Initial value for the log standard deviation
     :param use_expln: Use ``expln()`` function instead of ``exp()`` when using gSDE to ensure a positive standard deviation
     :param clip_mean: Clip the mean output when using gSDE to avoid numerical instability
-    :param features_extractor_class: Features extractor to use
+    :param features_extractor_class: Features extractor to use; ``None``: that of the class
     :param features_extractor_kwargs: Keyword arguments to pass to the features extractor
     :param normalize_images: Whether to normalize images or not, dividing by 255.0 (True by default)
     :param optimizer_class: The optimizer to use, ``th.optim.Adam`` by default
@@ -48,6 +48,7 @@ class REDQPolicy(SACPolicy):
 
     critic: EnsembleCritic  # type: ignore[assignment]
     critic_target: EnsembleCritic  # type: ignore[assignment]
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
     def __init__(
         self,
@@ -60,7 +61,7 @@ class REDQPolicy(SACPolicy):
         log_std_init: float = -3,
         use_expln: bool = False,
         clip_mean: float = 2.0,
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -84,7 +85,7 @@ class REDQPolicy(SACPolicy):
             log_std_init,
             use_expln,
             clip_mean,
-            features_extractor_class,
+            features_extractor_class or self.default_features_extractor,
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
@@ -121,30 +122,12 @@ MlpPolicy = REDQPolicy
 
 
 class CnnPolicy(REDQPolicy):
-    """
-    Policy class (with both actor and critics) for REDQ on images: :class:`REDQPolicy` with ``NatureCNN`` as the default
-    features extractor. Arguments as there.
-    """
+    """:class:`REDQPolicy` for images: the default features extractor is ``NatureCNN``."""
 
-    def __init__(
-        self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_features_extractor = NatureCNN
 
 
 class MultiInputPolicy(REDQPolicy):
-    """
-    Policy class (with both actor and critics) for REDQ on Dict observations: :class:`REDQPolicy` with
-    ``CombinedExtractor`` as the default features extractor. Arguments as there.
-    """
+    """:class:`REDQPolicy` for Dict observations: the default features extractor is ``CombinedExtractor``."""
 
-    def __init__(
-        self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_features_extractor = CombinedExtractor

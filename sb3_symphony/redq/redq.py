@@ -6,6 +6,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.sac.policies import Actor
 
@@ -181,9 +182,9 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         if self.target_entropy == "mbpo" and self.env is not None:
             spec = self.env.get_attr("spec")[0]
             name = spec.id.rpartition("/")[2].partition("-")[0] if spec is not None else ""
-            return MBPO_TARGET_ENTROPY.get(name, -float(np.prod(self.action_space.shape)))
+            return MBPO_TARGET_ENTROPY.get(name, -float(get_action_dim(self.action_space)))
         if self.target_entropy in ("auto", "mbpo"):
-            return -float(np.prod(self.action_space.shape))
+            return -float(get_action_dim(self.action_space))
         try:
             value = float(self.target_entropy)
         except ValueError:
@@ -249,7 +250,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         logs["ent_coef"].append(ent_coef.mean())
 
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-            ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+            ent_coef_loss = -(self.log_ent_coef * (log_prob + float(self.target_entropy)).detach()).mean()
             self.ent_coef_optimizer.zero_grad()
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()

@@ -1,5 +1,5 @@
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from gymnasium import spaces
@@ -77,7 +77,7 @@ class SymphonyPolicy(TD3Policy):
     :param lr_schedule: Learning rate schedule (could be constant)
     :param net_arch: The specification of the actor's and the critics' networks, two layers of 256 by default
     :param activation_fn: Activation function(s)
-    :param features_extractor_class: Features extractor to use
+    :param features_extractor_class: Features extractor to use; ``None``: that of the class
     :param features_extractor_kwargs: Keyword arguments to pass to the features extractor
     :param normalize_images: Whether to normalize images or not, dividing by 255.0 (True by default)
     :param optimizer_class: The optimizer to use, ``th.optim.Adam`` by default
@@ -94,6 +94,7 @@ class SymphonyPolicy(TD3Policy):
     actor: Actor
     critic: EnsembleCritic  # type: ignore[assignment]
     critic_target: EnsembleCritic  # type: ignore[assignment]
+    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
     def __init__(
         self,
@@ -102,7 +103,7 @@ class SymphonyPolicy(TD3Policy):
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: Activations | dict[str, Activations] = (nn.Identity, LeakySine),
-        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
@@ -123,7 +124,7 @@ class SymphonyPolicy(TD3Policy):
             lr_schedule,
             [256, 256] if net_arch is None else net_arch,
             activation_fn,  # type: ignore[arg-type]
-            features_extractor_class,
+            features_extractor_class or self.default_features_extractor,
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
@@ -180,30 +181,12 @@ MlpPolicy = SymphonyPolicy
 
 
 class CnnPolicy(SymphonyPolicy):
-    """
-    Policy class (with both actor and critics) for Symphony on images: :class:`SymphonyPolicy` with ``NatureCNN`` as the
-    default features extractor. Arguments as there.
-    """
+    """:class:`SymphonyPolicy` for images: the default features extractor is ``NatureCNN``."""
 
-    def __init__(
-        self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_features_extractor = NatureCNN
 
 
 class MultiInputPolicy(SymphonyPolicy):
-    """
-    Policy class (with both actor and critics) for Symphony on Dict observations: :class:`SymphonyPolicy` with
-    ``CombinedExtractor`` as the default features extractor. Arguments as there.
-    """
+    """:class:`SymphonyPolicy` for Dict observations: the default features extractor is ``CombinedExtractor``."""
 
-    def __init__(
-        self,
-        *args: Any,
-        features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    default_features_extractor = CombinedExtractor

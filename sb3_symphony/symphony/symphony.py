@@ -6,6 +6,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
@@ -175,7 +176,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
         self.critic_lr_schedule = FloatSchedule(rate)
         if isinstance(self.action_noise, str):
-            self.action_noise = DecayingNormalActionNoise(int(np.prod(self.action_space.shape)))
+            self.action_noise = DecayingNormalActionNoise(get_action_dim(self.action_space))
         # Mean value at the previous update, which the actor's loss compares with
         self.baseline = th.zeros((), device=self.device)
 
