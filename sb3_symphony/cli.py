@@ -115,9 +115,8 @@ def _add_list(commands: Any) -> None:
 def _list(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     if arguments["algo"]:
         check_algorithm(arguments["algo"])
-    for name in [arguments["algo"]] if arguments["algo"] else ALGORITHMS:
-        print(f"{name:10}{ALGORITHMS[name][2]}")
-        print(f"{'':10}{', '.join(shipped_environments(name))}")
+    names = [arguments["algo"]] if arguments["algo"] else list(ALGORITHMS)
+    print("\n".join(f"{name:10}{ALGORITHMS[name][2]}\n{'':10}{', '.join(shipped_environments(name))}" for name in names))
     return 0
 
 

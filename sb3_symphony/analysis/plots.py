@@ -80,7 +80,7 @@ def plot_training(run: Path, output: Path | None = None, window: int = 20) -> Pa
         label = f"evaluation, mean ± std of {results.shape[1]} episodes"
         axes.errorbar(at, mean, spread, fmt="o-", color=_EVALUATION, markersize=4, linewidth=1.2, capsize=2.5, label=label)
     if axes.has_data():
-        axes.legend(loc="best", frameon=True, framealpha=0.85, fontsize="small")
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize="small")  # beside the data, never over it
     else:
         axes.text(0.5, 0.5, "no finished episode", ha="center", va="center", transform=axes.transAxes)
     axes.set_title(_title(run))

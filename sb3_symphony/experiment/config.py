@@ -110,9 +110,8 @@ def _plain_expression(node: ast.AST, text: str) -> Any:
         case ast.List(elts=elements) | ast.Tuple(elts=elements):
             return [_plain_expression(element, text) for element in elements]
         case ast.Dict(keys=keys, values=values) if None not in keys:
-            return {
-                _plain_expression(key, text): _plain_expression(v, text) for key, v in zip(keys, values, strict=True) if key
-            }
+            plain = [_plain_expression(part, text) for part in (*keys, *values) if part]
+            return dict(zip(plain[: len(keys)], plain[len(keys) :], strict=True))
         case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(word.arg for word in keywords):
             return {str(word.arg): _plain_expression(word.value, text) for word in keywords}
         case ast.Name() | ast.Attribute():
@@ -165,11 +164,11 @@ class TrainOptions(BaseModel):
 
     algo: str = "symphony"
     env: str = "BipedalWalker-v3"
-    n_timesteps: int = Field(-1, ge=-1)
-    seed: int = Field(-1, ge=-1, lt=2**31)
+    n_timesteps: int = Field(default=-1, ge=-1)
+    seed: int = Field(default=-1, ge=-1, lt=2**31)
     log_folder: str = "logs"
     eval_freq: int = 10_000
-    eval_episodes: int = Field(10, ge=1)
+    eval_episodes: int = Field(default=10, ge=1)
     hyperparams: dict[str, Any] = {}
     conf_file: str | None = None
     env_kwargs: dict[str, Any] = {}
@@ -177,8 +176,8 @@ class TrainOptions(BaseModel):
     save_freq: int = -1
     device: str = "auto"
     num_threads: int = -1
-    log_interval: int = Field(-1, ge=-2)
-    verbose: int | None = Field(None, ge=0, le=2)
+    log_interval: int = Field(default=-1, ge=-2)
+    verbose: int | None = Field(default=None, ge=0, le=2)
     progress: bool | None = None
 
     @field_validator("n_timesteps")
@@ -198,7 +197,7 @@ def _wrapper_list(value: Any) -> Any:
     """Zoo's forms of ``env_wrapper`` (name, {name: arguments}, a list of both) as one list of (name, arguments)."""
     if value is None:
         return []
-    items = []
+    items: list[tuple[str, dict[str, Any]]] = []
     for item in value if isinstance(value, list) else [value]:
         if isinstance(item, str):
             items.append((item, {}))

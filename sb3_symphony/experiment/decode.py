@@ -23,12 +23,12 @@ from sb3_symphony.experiment.registry import suggestion
 
 _SB3 = "stable_baselines3.common"
 _OURS = "sb3_symphony.common"
-_BUFFERS = {
+_BUFFERS: dict[str, tuple[str, ...]] = {
     f"{_SB3}.buffers": ("ReplayBuffer", "DictReplayBuffer", "NStepReplayBuffer", "RolloutBuffer", "DictRolloutBuffer"),
     "stable_baselines3.her.her_replay_buffer": ("HerReplayBuffer",),
     f"{_OURS}.buffers": ("FadingReplayBuffer", "FadingDictReplayBuffer", "PrioritizedReplayBuffer"),
 }
-_EXTRACTORS = {f"{_SB3}.torch_layers": ("FlattenExtractor", "NatureCNN", "CombinedExtractor")}
+_EXTRACTORS: dict[str, tuple[str, ...]] = {f"{_SB3}.torch_layers": ("FlattenExtractor", "NatureCNN", "CombinedExtractor")}
 #: key → module → classes that it may name
 _CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
     "activation_fn": {

@@ -71,8 +71,8 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
     gamma = config.arguments.get("gamma")
     env = make_training_env(options.env, config.settings, gamma if isinstance(gamma, int | float) else None, seed)
     try:
-        arguments = algorithm_arguments(options.algo, algorithm, config, env.action_space)
         check_spaces(env, options.env, options.algo)
+        arguments = algorithm_arguments(options.algo, algorithm, config, env.action_space)
         if options.tensorboard_log:
             arguments["tensorboard_log"] = str(Path(options.tensorboard_log) / options.env.replace("/", "-"))
         return algorithm(env=env, seed=seed, device=_device(options.device), verbose=verbose, **arguments)
