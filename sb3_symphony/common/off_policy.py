@@ -176,28 +176,31 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Discount of the bootstrap value: ``gamma`` to the power of the steps summed in ``rewards``."""
         return self.gamma if batch.discounts is None else batch.discounts
 
-    def _log_update(self, n_updates_before: int, means: dict[str, list[th.Tensor]], noise_std: th.Tensor | float) -> None:
+    def _log_update(self, n_updates_before: int, logs: dict[str, list[th.Tensor]], noise_std: th.Tensor | float) -> None:
         """
         Record the mean of each quantity over the updates of one ``train()`` call: the only transfer off the device.
 
         :param n_updates_before: ``_n_updates`` when the call began
-        :param means: Log key (without ``train/``) to scalars, one per update
+        :param logs: Log key (without ``train/``) to tensors of one shape, one per update. ``q_values``
+            ``(n_critics, batch, 1)`` become ``q_mean`` and ``q_std``, the spread over the critics averaged over the batch
         :param noise_std: Standard deviation of the exploration noise in [-1, 1] action units
         """
+        means = {}
+        for key, values in logs.items():
+            stacked = th.stack(values)
+            if key == "q_values":
+                means["q_mean"], means["q_std"] = stacked.mean(), stacked.std(dim=1, correction=0).mean()
+            else:
+                means[key] = stacked.mean()
+        for key, value in zip(means, th.stack(list(means.values())).tolist(), strict=True):
+            self.logger.record(f"train/{key}", value)
+        self.logger.record("train/noise_std", float(noise_std))
+
         if self.num_timesteps < self._timesteps_at_update:  # learn() was called anew and the count restarted
             self._timesteps_at_update = 0
         transitions = max(1, self.num_timesteps - self._timesteps_at_update)
-        ratio = (self._n_updates - n_updates_before) / transitions
         self._timesteps_at_update = self.num_timesteps
-
-        kept = {key: th.stack(values).mean() for key, values in means.items() if values}
-        if isinstance(noise_std, th.Tensor):
-            kept["noise_std"] = noise_std
-        else:
-            self.logger.record("train/noise_std", noise_std)
-        for key, value in zip(kept, th.stack(list(kept.values())).tolist(), strict=True):
-            self.logger.record(f"train/{key}", value)
-        self.logger.record("train/update_ratio", ratio)
+        self.logger.record("train/update_ratio", (self._n_updates - n_updates_before) / transitions)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     # ---------------------------------------------------------------- saving

@@ -114,12 +114,11 @@ class FusedRegression(CriticRegression):
         group = optimizer.param_groups[0]
         for parameter in network.parameters:
             if not optimizer.state[parameter]:  # as Adam itself does at its first step
-                step = th.zeros((), dtype=th.float32)
+                step = th.zeros((), dtype=th.float32, device=parameter.device)
                 optimizer.state[parameter] = dict(
                     step=step, exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter)
                 )
         states = [optimizer.state[parameter] for parameter in network.parameters]
-        on_cpu = network.input.device.type == "cpu"
         adam(
             network.parameters,
             network.grads,
@@ -127,8 +126,7 @@ class FusedRegression(CriticRegression):
             [state["exp_avg_sq"] for state in states],
             [],
             [state["step"] for state in states],
-            fused=on_cpu,
-            foreach=not on_cpu,  # a fused step on CUDA would need the step counts there: not what Adam saves by default
+            fused=True,
             amsgrad=False,
             maximize=False,
             beta1=group["betas"][0],
@@ -154,7 +152,9 @@ def not_fusable(critic: EnsembleCritic) -> str | None:
         return f"no hand-written passes for {layer}"
     if type(optimizer) not in (th.optim.Adam, th.optim.AdamW):
         return f"the optimizer is {type(optimizer).__name__}, not Adam or AdamW"
-    special = [name for name in ("amsgrad", "maximize", "capturable", "differentiable") if optimizer.defaults.get(name)]
+    if not optimizer.defaults["fused"]:
+        return f"the optimizer has fused={optimizer.defaults['fused']}"
+    special = [name for name in ("amsgrad", "maximize", "capturable", "differentiable") if optimizer.defaults[name]]
     return f"the optimizer has {special[0]}=True" if special else None
 
 

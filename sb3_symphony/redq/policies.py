@@ -9,7 +9,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from sb3_symphony.common.checks import check_choice
-from sb3_symphony.common.ensembles import EnsembleCritic
+from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults
 from sb3_symphony.common.regression import ENGINES
 
 
@@ -89,7 +89,7 @@ class REDQPolicy(SACPolicy):
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
-            optimizer_kwargs,
+            {**adam_defaults(optimizer_class), **(optimizer_kwargs or {})},
             n_critics,
             share_features_extractor,
         )

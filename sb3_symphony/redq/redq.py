@@ -174,7 +174,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         if learned:
             # The log is optimised, as in SB3
             self.log_ent_coef = th.full((1,), np.log(initial), device=self.device, dtype=th.float32).requires_grad_()
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1), fused=True)
         else:
             self.ent_coef_tensor = th.tensor(initial, device=self.device)
 
@@ -225,9 +225,8 @@ class REDQ(EnsembleOffPolicyAlgorithm):
                 self._n_updates += 1
 
                 logs["critic_loss"].append(loss)
-                logs["q_mean"].append(q_values.mean())
-                logs["q_std"].append(q_values.std(dim=0, correction=0).mean())
-                logs["target_q_mean"].append(target.mean())
+                logs["q_values"].append(q_values)
+                logs["target_q_mean"].append(target)
 
             if self._n_updates % self.policy_delay == 0:
                 self._update_actor(batches[-1], ent_coef, logs)

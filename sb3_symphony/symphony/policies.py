@@ -11,7 +11,7 @@ from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from sb3_symphony.common.checks import check_choice
-from sb3_symphony.common.ensembles import EnsembleCritic, hidden_layers, mlp
+from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults, hidden_layers, mlp
 from sb3_symphony.common.layers import LeakySine
 from sb3_symphony.common.regression import ENGINES
 
@@ -128,7 +128,7 @@ class SymphonyPolicy(TD3Policy):
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
-            optimizer_kwargs,
+            {**adam_defaults(optimizer_class), **(optimizer_kwargs or {})},
             n_critics,
             share_features_extractor,
         )

@@ -223,9 +223,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
                 self._n_updates += 1
 
                 logs["critic_loss"].append(loss)
-                logs["q_mean"].append(q_values.mean())
-                logs["q_std"].append(q_values.std(dim=0, correction=0).mean())
-                logs["target_q_mean"].append(target.mean())
+                logs["q_values"].append(q_values)
+                logs["target_q_mean"].append(target)
 
             if self._n_updates % self.policy_delay == 0:
                 self._update_actor(batches[-1], logs)
