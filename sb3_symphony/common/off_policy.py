@@ -20,7 +20,8 @@ from sb3_symphony.common.losses import CRITIC_LOSSES
 from sb3_symphony.common.noise import DecayingActionNoise
 from sb3_symphony.common.regression import make_regression
 
-N_STEP_BUFFERS = (NStepReplayBuffer, FadingReplayBuffer, FadingDictReplayBuffer, PrioritizedReplayBuffer)
+FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
+N_STEP_BUFFERS = (NStepReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer)
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 
 
@@ -105,6 +106,8 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
             for_dict, for_n_steps, otherwise = self.default_buffers
             is_dict = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = chosen = for_dict if is_dict else for_n_steps if n_steps > 1 else otherwise
+        if "fade_factor" in self.replay_buffer_kwargs and not issubclass(chosen, FADING_BUFFERS):
+            raise ValueError(f"fade_factor={self.replay_buffer_kwargs['fade_factor']!r}: {chosen.__name__} does not fade")
         if n_steps > 1:
             if not issubclass(chosen, N_STEP_BUFFERS):
                 raise ValueError(f"n_steps={n_steps}: {chosen.__name__} has no n-step returns, expected n_steps=1")

@@ -15,7 +15,7 @@ from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
 from sb3_symphony.common.noise import DecayingNormalActionNoise
-from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm, noise_std
+from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, noise_std
 from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
 
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
@@ -194,8 +194,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         logs: dict[str, list[th.Tensor]] = defaultdict(list)
         if not self._initial_updates_done:
             uniform, faded = self.initial_gradient_steps
-            fades = isinstance(self.replay_buffer, (FadingReplayBuffer, FadingDictReplayBuffer))
-            self._update(uniform, batch_size, logs, **(dict(uniform=True) if fades else {}))
+            fades = isinstance(self.replay_buffer, FADING_BUFFERS)
+            self._update(uniform, batch_size, logs, **({"uniform": True} if fades else {}))
             self._update(faded, batch_size, logs)
             self._initial_updates_done = True
         self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
