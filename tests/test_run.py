@@ -636,7 +636,7 @@ def test_number_of_critics(algorithm, small):
         assert model.n_critics == model.critic.n_critics == model.critic_target.n_critics == 4
         obs, actions = th.zeros(5, 3), th.zeros(5, 1)
         assert model.critic(obs, actions).shape == (4, 5, 1)
-    with pytest.raises(ValueError, match="n_critics=3.*n_critics=4"):
+    with pytest.raises(ValueError, match=r"n_critics=3.*n_critics=4"):
         small(algorithm, n_critics=3, policy_kwargs=dict(n_critics=4))
 
 
