@@ -34,9 +34,16 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {' '.join(message.split())}\n")
 
+    def unknown(self, argument: str) -> NoReturn:
+        """
+        :param argument: an argument that no command takes
+        """
+        self.error(f"unknown argument '{argument}'{suggestion(argument, self._option_string_actions)}")
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
-            near = suggestion(str(value), action.choices) or f" — expected one of {', '.join(action.choices)}"
+            choices = [str(choice) for choice in action.choices]
+            near = suggestion(str(value), choices) or f" — expected one of {', '.join(choices)}"
             raise argparse.ArgumentError(None, f"unknown {action.dest} '{value}'{near}")
 
 
@@ -83,7 +90,7 @@ def _add_train(commands: Any) -> None:
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
     add("--verbose", type=int, choices=(0, 1, 2), help="log to the terminal (default: 1, with a progress bar 0)")
     defaults = TrainOptions().model_dump()
-    parser.set_defaults(run=_train, **{**defaults, "hyperparams": [], "env_kwargs": []})
+    parser.set_defaults(run=_train, parser=parser, **{**defaults, "hyperparams": [], "env_kwargs": []})
 
 
 def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
@@ -109,7 +116,7 @@ def _add_list(commands: Any) -> None:
         epilog="examples:\n  sb3-symphony list\n  sb3-symphony list --algo sac\n",
     )
     parser.add_argument("--algo", metavar="ALGO", help="only this algorithm")
-    parser.set_defaults(run=_list)
+    parser.set_defaults(run=_list, parser=parser)
 
 
 def _list(arguments: dict[str, Any], argv: Sequence[str]) -> int:
@@ -143,8 +150,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: exit status: 0, 2 for a mistake in the input, 130 after an interruption
     """
     argv = sys.argv[1:] if argv is None else list(argv)
-    arguments = vars(make_parser().parse_args(argv))
-    command, run = arguments.pop("command"), arguments.pop("run")
+    namespace, unknown = make_parser().parse_known_args(argv)
+    arguments = vars(namespace)
+    command, run, parser = (arguments.pop(name) for name in ("command", "run", "parser"))
+    if unknown:
+        parser.unknown(unknown[0])
     try:
         return run(arguments, argv)
     except ConfigError as error:

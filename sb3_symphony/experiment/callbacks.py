@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, ProgressBarCallback
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 
@@ -97,9 +106,9 @@ class SeededEvaluation(EvalCallback):
             return False
 
 
-class ReturnProgressBar(ProgressBarCallback):
+class ReturnProgressBar(BaseCallback):
     """
-    Progress bar that shows the mean return of the latest training episodes and the last evaluation.
+    Live progress bar with the mean return of the latest ten training episodes and of the last evaluation.
 
     :param evaluation: evaluation of the run, if there is one
     """
@@ -107,29 +116,33 @@ class ReturnProgressBar(ProgressBarCallback):
     def __init__(self, evaluation: EvalCallback | None = None) -> None:
         super().__init__()
         self.evaluation = evaluation
-        self._open = False
+        self.progress = Progress(
+            TaskProgressColumn(),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            "<",
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+        )
 
     def _on_training_start(self) -> None:
-        super()._on_training_start()
-        self._open = True
+        self.progress.start()
+        self.task = self.progress.add_task("", total=self.locals["total_timesteps"])
 
     def _on_step(self) -> bool:
-        finished = any("episode" in info for info in self.locals["infos"])
-        evaluated = self.evaluation is not None and self.evaluation.evaluations_results
-        if finished and self.model.ep_info_buffer:
+        self.progress.update(self.task, completed=self.num_timesteps)
+        if any("episode" in info for info in self.locals["infos"]) and self.model.ep_info_buffer:
             latest = [episode["r"] for episode in self.model.ep_info_buffer][-10:]
             description = f"return {np.mean(latest):.0f}"
-            if evaluated:
-                assert self.evaluation is not None
-                description += f", evaluated {np.mean(self.evaluation.evaluations_results[-1]):.0f}"
-            self.pbar.set_description(description, refresh=False)
-        return super()._on_step()
+            if self.evaluation is not None and self.evaluation.evaluations_results:
+                description += f", eval {np.mean(self.evaluation.evaluations_results[-1]):.0f}"
+            self.progress.update(self.task, description=description)
+        return True
 
     def close(self) -> None:
         """Leave the terminal in order, also after an error."""
-        if self._open:
-            self._open = False
-            super()._on_training_end()
+        self.progress.stop()
 
     def _on_training_end(self) -> None:
         self.close()

@@ -274,7 +274,10 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
             raise ConfigError(f"{key}: missing — expected in the configuration") from None
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"unknown option '{key}'{suggestion(key, model.model_fields)}") from None
-        message = first["msg"].removeprefix("Value error, ").replace("Input should be", "expected", 1)
+        message = (
+            first["msg"].removeprefix("Value error, ").partition(", unable to")[0].replace("Input should be", "expected", 1)
+        )
+        message = message.replace("greater than or equal to", "a number >=").replace("less than", "a number <")
         message = message.replace("a valid integer", "a whole number").replace("a valid ", "a ")
         raise ConfigError(f"{key}: {values.get(key)!r} — {message}") from None
 

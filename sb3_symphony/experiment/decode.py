@@ -9,11 +9,11 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin
 
 import gymnasium as gym
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, PydanticSchemaGenerationError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import LinearSchedule
@@ -104,14 +104,11 @@ def argument_types(class_: type) -> dict[str, Any]:
         if "__init__" not in vars(parent):
             continue
         init = vars(parent)["__init__"]
-        try:
-            hints = get_type_hints(init)
-        except NameError:  # a name imported for type checkers only
-            hints = {}
-        parameters = inspect.signature(init).parameters.values()
+        parameters = inspect.signature(init, eval_str=True).parameters.values()
         for parameter in parameters:
             if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
-                found.setdefault(parameter.name, hints.get(parameter.name, Any))
+                annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
+                found.setdefault(parameter.name, annotation)
         if all(parameter.kind != parameter.VAR_KEYWORD for parameter in parameters):
             break
     return found
@@ -161,7 +158,7 @@ def _describe(annotation: Any) -> str:
         elif origin is type:
             parts.append("the name of a class")
         elif origin is list:
-            parts.append("a list")
+            parts.append(f"[{_describe(get_args(alternative)[0])}, …]")
         elif isinstance(alternative, type):
             parts.append(f"{{{alternative.__name__}: {{…}}}}")
     return " or ".join(dict.fromkeys(parts))
@@ -182,16 +179,17 @@ def _numbers(value: Any) -> Iterable[float]:
 
 def _check_range(key: str, plain: Any, value: Any, lowest: float) -> None:
     """Numbers are finite; a name that means a count or a fraction has that range; else they are at least ``lowest``."""
+    name = key.rpartition(" ")[2]
     for number in _numbers(value):
         if not math.isfinite(number):
             raise ConfigError(f"{key}: {plain!r} — expected a finite number")
-        if key in _AT_LEAST_ONE or key == "net_arch":
+        if name in _AT_LEAST_ONE or name == "net_arch":
             if number < 1:
                 raise ConfigError(f"{key}: {plain!r} — expected a number >= 1")
-        elif key in _FRACTION:
+        elif name in _FRACTION:
             if not 0 <= number <= 1:
                 raise ConfigError(f"{key}: {plain!r} — expected a number in [0, 1]")
-        elif key not in _ANY_SIGN and number < lowest:
+        elif name not in _ANY_SIGN and number < lowest:
             raise ConfigError(f"{key}: {plain!r} — expected a number >= {lowest:g}")
 
 
@@ -203,10 +201,30 @@ def _typed(key: str, plain: Any, value: Any, annotation: Any, lowest: float) -> 
     try:
         adapter: TypeAdapter = TypeAdapter(annotation, config=ConfigDict(arbitrary_types_allowed=True))
         value = adapter.validate_python(value)
+    except PydanticSchemaGenerationError:  # an annotation that pydantic cannot read says nothing
+        return value
     except ValidationError:
         raise expected from None
     _check_range(key, plain, value, lowest)
     return value
+
+
+def typed_arguments(
+    plain: Mapping[str, Any], class_: type, filled: Iterable[str], lowest: float = -math.inf
+) -> dict[str, Any]:
+    """
+    Check arguments of a class against its constructor.
+
+    :param plain: names and plain values
+    :param class_: the class
+    :param filled: arguments that a configuration does not give
+    :param lowest: smallest number
+    :return: the arguments, of the annotated types
+    :raises ConfigError: for an unknown name or a wrong value
+    """
+    types = argument_types(class_)
+    check_keys(plain, types.keys() - {"self", *filled}, "argument", class_.__name__)
+    return {key: _typed(f"{class_.__name__}: {key}", value, value, types[key], lowest) for key, value in plain.items()}
 
 
 def _schedule(key: str, value: Any) -> Any:
@@ -241,11 +259,12 @@ def _action_noise(value: Any, n_actions: int, n_envs: int) -> Any:
     class_ = class_by_name("action_noise", name)
     types = argument_types(class_)
     filled = {"n_actions": n_actions, "n_envs": n_envs}
-    check_keys(arguments, types.keys() - {"self", *filled}, "argument", name)
-    _check_range("action_noise", value, {k: v for k, v in arguments.items() if k != "mean"}, 0)
-    if "n_actions" not in types:  # SB3's own noises want one number per action
-        arguments = {"mean": 0.0, **arguments}
-        arguments = {k: np.full(n_actions, v) if k in ("mean", "sigma") else v for k, v in arguments.items()}
+    if "n_actions" in types:
+        arguments = typed_arguments(arguments, class_, filled, lowest=0)
+    else:  # SB3's own noises want one number per action
+        check_keys(arguments, types.keys() - {"self", *filled}, "argument", name)
+        _check_range("action_noise", value, {k: v for k, v in arguments.items() if k != "mean"}, 0)
+        arguments = {k: np.full(n_actions, v) if k in ("mean", "sigma") else v for k, v in {"mean": 0.0, **arguments}.items()}
     arguments |= {key: filled[key] for key in filled if key in types}
     try:
         return class_(**arguments)
@@ -319,6 +338,10 @@ def algorithm_arguments(
             value = _schedule(key, value)
         decoded[key] = _typed(key, plain, value, types[key], 0)
     buffer_class, buffer_kwargs = decoded.get("replay_buffer_class"), decoded.get("replay_buffer_kwargs")
+    if getattr(buffer_class, "__name__", "") == "PrioritizedReplayBuffer" and not algorithm.__module__.startswith(
+        "sb3_symphony."
+    ):
+        raise ConfigError(f"replay_buffer_class: 'PrioritizedReplayBuffer' — {name} does not apply its importance weights")
     if buffer_class is not None and buffer_kwargs:
         check_keys(buffer_kwargs, argument_types(buffer_class), "replay_buffer_kwargs key", buffer_class.__name__)
     return {"policy": settings.policy, **decoded}

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
 from sb3_symphony.experiment.config import ConfigError, RunSettings
-from sb3_symphony.experiment.decode import argument_types, check_keys
+from sb3_symphony.experiment.decode import typed_arguments
 from sb3_symphony.experiment.registry import suggestion
 
 #: evaluation episode i runs on environment seed 10 000 + i
@@ -94,8 +95,8 @@ def split_wrappers(named: list[tuple[str, dict[str, Any]]]) -> tuple[Wrappers, W
     training: Wrappers = []
     for name, arguments in named:
         class_ = find_wrapper(name)
-        check_keys(arguments, argument_types(class_).keys() - {"self", "env"}, "argument", name)
-        (training if issubclass(class_, _TRAINING_ONLY) else task).append(partial(class_, **arguments))
+        wrapper = partial(class_, **typed_arguments(arguments, class_, ["env"]))
+        (training if issubclass(class_, _TRAINING_ONLY) else task).append(wrapper)
     return task, training
 
 
@@ -124,16 +125,16 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
             env = gym.make(env_id, **env_kwargs)
     except (gym.error.DependencyNotInstalled, ImportError) as error:
         message = str(error)
-        if "mujoco" in message.lower():
+        if "mujoco" in message.lower() and find_spec("mujoco") is None:
             message = 'MuJoCo is not installed: pip install "sb3-symphony[mujoco]"'
-        raise ConfigError(f"{env_id}: cannot be made — {message}") from None
+        raise ConfigError(f"environment '{env_id}' cannot be made — {message}") from None
     except gym.error.UnregisteredEnv:
         near = suggestion(env_id, gym.registry) or " — expected a registered id such as BipedalWalker-v3"
         raise ConfigError(f"unknown environment '{env_id}'{near}") from None
     except gym.error.Error as error:
-        raise ConfigError(f"{env_id}: cannot be made — {error}") from None
+        raise ConfigError(f"environment '{env_id}' cannot be made — {error}") from None
     except (TypeError, ValueError, AssertionError, OSError) as error:
-        raise ConfigError(f"{env_id}: cannot be made with {env_kwargs} — {error}") from None
+        raise ConfigError(f"environment '{env_id}' cannot be made with {env_kwargs} — {error}") from None
     if needs_fresh_world(env):
         env = FreshBox2DWorld(env)
     return _wrapped(env, wrappers)
@@ -158,7 +159,7 @@ def _normalized(env: VecEnv, settings: RunSettings, gamma: float | None, trainin
     if settings.normalize is False:
         return env
     arguments = {} if settings.normalize is True else dict(settings.normalize)
-    check_keys(arguments, argument_types(VecNormalize).keys() - {"self", "venv", "training"}, "argument", "normalize")
+    arguments = typed_arguments(arguments, VecNormalize, ["venv", "training"], lowest=0)
     if gamma is not None:
         arguments.setdefault("gamma", gamma)
     if not training:

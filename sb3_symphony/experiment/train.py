@@ -79,7 +79,7 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
     except ConfigError:
         env.close()
         raise
-    except (ValueError, TypeError, AssertionError) as error:
+    except (ValueError, TypeError, AssertionError, MemoryError) as error:
         env.close()
         raise ConfigError(f"{options.algo} on {options.env}: {error}") from error
 
