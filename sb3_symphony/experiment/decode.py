@@ -147,7 +147,7 @@ def _describe(annotation: Any) -> str:
         if alternative in words:
             if not (alternative is int and float in alternatives):
                 parts.append(words[alternative])
-        elif origin is Callable or get_origin(alternative) is get_origin(Callable[[], None]):
+        elif Callable in (origin, alternative):
             parts.append("lin_<number>")
         elif origin is Literal:
             parts += [repr(choice) for choice in get_args(alternative)]
@@ -238,7 +238,7 @@ def _schedule(key: str, value: Any) -> Any:
 
 
 def _takes_schedule(annotation: Any) -> bool:
-    return any(get_origin(item) is get_origin(Callable[[], None]) for item in _alternatives(annotation))
+    return any(Callable in (get_origin(item), item) for item in _alternatives(annotation))
 
 
 def _named_classes(key: str, value: Any) -> Any:

@@ -140,12 +140,13 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
     return _wrapped(env, wrappers)
 
 
-def check_spaces(env: VecEnv, env_id: str, algo: str) -> None:
+def check_spaces(env: VecEnv, env_id: str, algo: str, policy: str) -> None:
     """
     :param env: the environment
     :param env_id: its id
     :param algo: name of the algorithm
-    :raises ConfigError: if the algorithm cannot act in its action space
+    :param policy: name of the policy
+    :raises ConfigError: if algorithm or policy do not fit its spaces
     """
     space = env.action_space
     allowed = _ON_POLICY_SPACES if algo in ("ppo", "trpo") else (spaces.Box,)
@@ -153,6 +154,8 @@ def check_spaces(env: VecEnv, env_id: str, algo: str) -> None:
         raise ConfigError(f"{env_id}: its action space is {space} — {algo} needs a continuous one (Box)")
     if isinstance(space, spaces.Box) and not np.all(np.isfinite([space.low, space.high])):
         raise ConfigError(f"{env_id}: its action space {space} is unbounded — {algo} needs finite limits")
+    if policy == "MultiInputPolicy" and not isinstance(env.observation_space, spaces.Dict):
+        raise ConfigError(f"policy: 'MultiInputPolicy' — needs Dict observations, {env_id} has {env.observation_space}")
 
 
 def _normalized(env: VecEnv, settings: RunSettings, gamma: float | None, training: bool) -> VecEnv:

@@ -71,7 +71,7 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
     gamma = config.arguments.get("gamma")
     env = make_training_env(options.env, config.settings, gamma if isinstance(gamma, int | float) else None, seed)
     try:
-        check_spaces(env, options.env, options.algo)
+        check_spaces(env, options.env, options.algo, config.settings.policy)
         arguments = algorithm_arguments(options.algo, algorithm, config, env.action_space)
         if options.tensorboard_log:
             arguments["tensorboard_log"] = str(Path(options.tensorboard_log) / options.env.replace("/", "-"))

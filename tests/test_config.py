@@ -1,0 +1,257 @@
+"""Reading and checking configurations: safe, with clear messages, and fitting the classes they name."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from gymnasium import spaces
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_symphony.common.buffers import FadingReplayBuffer
+from sb3_symphony.common.noise import StickyActionNoise
+from sb3_symphony.common.wrappers import RewardFloor
+from sb3_symphony.experiment.config import (
+    ConfigError,
+    RunConfig,
+    TrainOptions,
+    load_config,
+    parse_expression,
+    parse_pairs,
+    parse_yaml,
+    read_yaml,
+    shipped_environments,
+    shipped_folder,
+    validated,
+)
+from sb3_symphony.experiment.decode import algorithm_arguments, argument_types, class_by_name
+from sb3_symphony.experiment.environment import find_wrapper, split_wrappers
+from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm, suggestion
+
+ACTIONS = spaces.Box(-1.0, 1.0, (4,))
+
+
+def config(algo="sac", env="Pendulum-v1", **hyperparams) -> RunConfig:
+    return load_config(validated(TrainOptions, {"algo": algo, "env": env, "hyperparams": hyperparams}))
+
+
+def decode(algo="sac", env="Pendulum-v1", **hyperparams):
+    return algorithm_arguments(algo, load_algorithm(algo), config(algo, env, **hyperparams), ACTIONS)
+
+
+@pytest.mark.parametrize("text, value", [("1e-3", 1e-3), ("1e6", 1e6), ("-2.5E+2", -250.0), ("3e4", 3e4), ("7_0e1", 700.0)])
+def test_numbers_without_a_dot(text, value):
+    assert parse_yaml(text, "here") == value
+
+
+@pytest.mark.parametrize("text", ["1e", "e3", "lin_1e-3", "1e3x"])
+def test_text_stays_text(text):
+    assert parse_yaml(text, "here") == text
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["!!python/object/apply:os.system [ls]", "!!python/name:os.system", "a: !!python/tuple [1, 2]", "!mine {a: 1}"],
+)
+def test_tags_are_refused(text):
+    with pytest.raises(ConfigError, match=r"here, line 1: tag '!.*' refused"):
+        parse_yaml(text, "here")
+
+
+@pytest.mark.parametrize("text", ["{a: [1", "a: b: c", "\t- x", "a: *unknown", "\x00"])
+def test_damaged_yaml_is_one_line(text):
+    with pytest.raises(ConfigError, match=r"here.*not valid YAML") as error:
+        parse_yaml(text, "here")
+    assert "\n" not in str(error.value)
+
+
+def test_pairs():
+    assert parse_pairs(["a:1e-3", "b:{c: [1, 2]}", "d:lin_3e-4", "e:'x'"], "-p") == {
+        "a": 1e-3,
+        "b": {"c": [1, 2]},
+        "d": "lin_3e-4",
+        "e": "x",
+    }
+    with pytest.raises(ConfigError, match=r"a=1.*key:value"):
+        parse_pairs(["a=1"], "-p")
+
+
+def test_zoo_expressions():
+    text = "dict(net_arch=dict(pi=[64, 64], qf=(32,)), activation_fn=nn.ReLU, log_std_init=-2, ortho_init=False)"
+    expected = {"net_arch": {"pi": [64, 64], "qf": [32]}, "activation_fn": "nn.ReLU", "log_std_init": -2, "ortho_init": False}
+    assert parse_expression(text) == expected
+    assert parse_expression("{'norm_obs': True, 'norm_reward': False}") == {"norm_obs": True, "norm_reward": False}
+    for bad in ("__import__('os').system('ls')", "dict(**{})", "[x for x in y]", "1 +", "dict(a=open('x'))", "{[1]: 2}"):
+        with pytest.raises(ConfigError):
+            parse_expression(bad)
+
+
+def test_merging():
+    merged = config(**{"batch_size": 64, "policy_kwargs.net_arch": [8], "gamma": 0.9})
+    assert merged.plain["learning_rate"] == 1e-3  # shipped for Pendulum-v1
+    assert merged.arguments == {"learning_rate": 1e-3, "batch_size": 64, "policy_kwargs": {"net_arch": [8]}, "gamma": 0.9}
+    walker = config(env="BipedalWalker-v3", **{"policy_kwargs.net_arch": [8]})
+    assert walker.arguments["policy_kwargs"] == {"net_arch": [8], "log_std_init": -3, "use_expln": True}
+    unknown_env = config(env="Reacher-v4")
+    assert unknown_env.settings.n_timesteps == 1_000_000  # the default entry
+
+
+def test_conf_file_stands_instead_of_the_shipped_one(tmp_path):
+    path = tmp_path / "own.yml"
+    path.write_text("Pendulum-v1: {n_timesteps: 1e3, batch_size: 32}\ndefault: {n_timesteps: 7, policy: MlpPolicy}\n")
+    options = {"algo": "sac", "env": "Pendulum-v1", "conf_file": str(path)}
+    loaded = load_config(validated(TrainOptions, options))
+    assert loaded.plain == {"n_timesteps": 1000, "batch_size": 32}
+    assert load_config(validated(TrainOptions, {**options, "env": "X-v0"})).settings.n_timesteps == 7
+    path.write_text("n_timesteps: 5\ngamma: 0.5\n")  # flat, as in a run folder
+    assert load_config(validated(TrainOptions, options)).plain == {"n_timesteps": 5, "gamma": 0.5}
+    assert load_config(validated(TrainOptions, {**options, "n_timesteps": 9})).plain["n_timesteps"] == 9
+
+
+def test_values_are_decoded():
+    arguments = decode(
+        learning_rate="lin_3e-4",
+        buffer_size=1e4,
+        train_freq=[1, "episode"],
+        action_noise={"StickyActionNoise": {"sigma": 0.2, "hold": 3}},
+        replay_buffer_class="FadingReplayBuffer",
+        replay_buffer_kwargs={"fade_factor": 5},
+        policy_kwargs={"activation_fn": "nn.ELU", "optimizer_class": "AdamW", "net_arch": {"pi": [8], "qf": [16]}},
+        ent_coef="auto_0.1",
+    )
+    assert isinstance(arguments["learning_rate"], LinearSchedule)
+    assert arguments["learning_rate"](0.5) == pytest.approx(1.5e-4)
+    assert arguments["buffer_size"] == 10_000 and isinstance(arguments["buffer_size"], int)
+    assert arguments["train_freq"] == (1, "episode")
+    noise = arguments["action_noise"]
+    assert isinstance(noise, StickyActionNoise) and noise.n_actions == 4 and noise.hold == 3
+    assert arguments["replay_buffer_class"] is FadingReplayBuffer
+    assert arguments["policy_kwargs"]["activation_fn"] is th.nn.ELU
+    assert arguments["policy_kwargs"]["optimizer_class"] is th.optim.AdamW
+    assert arguments["policy_kwargs"]["net_arch"] == {"pi": [8], "qf": [16]}
+    assert arguments["ent_coef"] == "auto_0.1"
+
+
+def test_zoo_noise():
+    noise = decode("td3", noise_type="normal", noise_std=0.3)["action_noise"]
+    assert isinstance(noise, NormalActionNoise)
+    np.testing.assert_array_equal(noise._sigma, np.full(4, 0.3))
+    assert decode("symphony", action_noise="default")["action_noise"] == "default"
+    assert decode("symphony", action_noise=None)["action_noise"] is None
+
+
+def test_class_names():
+    for name in ("ReLU", "nn.ReLU", "th.nn.ReLU", "torch.nn.ReLU"):
+        assert class_by_name("activation_fn", name) is th.nn.ReLU
+    for name in ("LU", "os.system", "torch.nn.Linear", "torch.optim.Adam", 5, ""):
+        with pytest.raises(ConfigError, match="unknown class"):
+            class_by_name("activation_fn", name)
+
+
+@pytest.mark.parametrize(
+    "algo, key, value, message",
+    [
+        (
+            "symphony",
+            "learning_ratee",
+            1,
+            "unknown hyper-parameter 'learning_ratee' for symphony: did you mean 'learning_rate'?",
+        ),
+        ("sac", "learning_rate", "fast", "learning_rate: 'fast' — expected a number or lin_<number>"),
+        ("sac", "learning_rate", "lin_fast", "expected a number or lin_<number>"),
+        ("sac", "learning_rate", True, "expected a number or lin_<number>"),
+        ("sac", "learning_rate", "lin_-1", "expected a number >= 0"),
+        ("sac", "learning_rate", float("nan"), "expected a finite number"),
+        ("redq", "buffer_size", -5, "buffer_size: -5 — expected a number >= 1"),
+        ("sac", "batch_size", 1.5, "batch_size: 1.5 — expected a whole number"),
+        ("sac", "gamma", 1.1, r"expected a number in \[0, 1\]"),
+        ("sac", "train_freq", "often", r"expected a whole number or \[a whole number, a name\]"),
+        ("sac", "policy", "MlpPolcy", "did you mean 'MlpPolicy'"),
+        ("sac", "policy_kwargs.net_archh", [4], "did you mean 'net_arch'"),
+        ("sac", "policy_kwargs.net_arch", [4, 0], "expected a number >= 1"),
+        ("sac", "policy_kwargs.activation_fn", "Relu", "did you mean 'ReLU'"),
+        ("sac", "policy_kwargs", [1], r"policy_kwargs: \[1\] — expected a mapping"),
+        ("sac", "replay_buffer_class", "FadeReplayBuffer", "did you mean"),
+        ("sac", "replay_buffer_class", "PrioritizedReplayBuffer", "does not apply its importance weights"),
+        ("sac", "action_noise", {"StickyActionNoise": {"sigm": 1}}, "did you mean 'sigma'"),
+        ("sac", "action_noise", {"StickyActionNoise": {"sigma": -1}}, "expected a number >= 0"),
+        ("sac", "action_noise", 0.1, "action_noise: 0.1 — expected {NameOfTheNoise"),
+        ("sac", "seed", 3, "set on the command line"),
+        ("sac", "device", "cpu", "set on the command line"),
+        ("sac", "n_envs", 0, "n_envs: 0 — expected a number >= 1"),
+        ("sac", "n_envs", True, "n_envs: True — expected a whole number"),
+        ("sac", "n_timesteps", "many", "n_timesteps: 'many' — expected a whole number"),
+        ("sac", "env_wrapper", 3, "expected a dotted name"),
+        ("sac", "noise_type", "normal", "expected both or neither"),
+        ("td3", "noise_type", "pink", "noise_type: 'pink' — expected 'normal' or 'ornstein-uhlenbeck'"),
+    ],
+)
+def test_wrong_values(algo, key, value, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        decode(algo, **{key: value})
+    assert "\n" not in str(error.value)
+
+
+def test_noise_type_for_an_algorithm_without_noise():
+    with pytest.raises(ConfigError, match="ppo takes no noise_type"):
+        decode("ppo", noise_type="normal", noise_std=0.1)
+
+
+def test_wrappers():
+    assert find_wrapper("sb3_symphony.common.wrappers.RewardFloor") is RewardFloor
+    named = [("gymnasium.wrappers.ClipAction", {}), ("sb3_symphony.common.wrappers.RewardFloor", {"floor": -3})]
+    task, training = split_wrappers(named)
+    assert [w.func for w in task] == [gym.wrappers.ClipAction] and [w.func for w in training] == [RewardFloor]
+    for name in (
+        "os.system",
+        "stable_baselines3.common.monitor.Monitor",  # writes files
+        "gymnasium.wrappers.RecordVideo",
+        "gymnasium.wrappers.np",
+        "sb3_contrib.nothing.X",
+        "sb3_symphony.cli.main",
+    ):
+        with pytest.raises(ConfigError, match="env_wrapper"):
+            find_wrapper(name)
+    with pytest.raises(ConfigError, match="did you mean 'RewardFloor'"):
+        find_wrapper("sb3_symphony.common.wrappers.RewardFlor")
+    with pytest.raises(ConfigError, match="did you mean 'floor'"):
+        split_wrappers([("sb3_symphony.common.wrappers.RewardFloor", {"flor": 1})])
+    with pytest.raises(ConfigError, match="expected a number"):
+        split_wrappers([("sb3_symphony.common.wrappers.RewardFloor", {"floor": "low"})])
+
+
+def test_suggestions():
+    assert suggestion("bipedalwalker-v3", ["BipedalWalker-v3"]) == ": did you mean 'BipedalWalker-v3'?"
+    assert suggestion("zzz", ["sac"]) == ""
+
+
+def test_every_algorithm_is_shipped_for_the_main_environments():
+    wanted = {"Pendulum-v1", "BipedalWalker-v3", "BipedalWalkerHardcore-v3", "Hopper-v4", "Hopper-v5"}
+    for algo in ALGORITHMS:
+        assert wanted <= set(shipped_environments(algo)), algo
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_shipped_entry_fits_its_class(algo):
+    for env in [*shipped_environments(algo), "default"]:
+        loaded = config(algo, env)
+        assert yaml.safe_load(yaml.safe_dump(loaded.plain)) == loaded.plain
+        arguments = algorithm_arguments(algo, load_algorithm(algo), loaded, ACTIONS)
+        assert arguments.keys() <= argument_types(load_algorithm(algo)).keys()
+        split_wrappers(loaded.settings.env_wrapper)
+
+
+def test_shipped_hopper_entries_agree():
+    for algo in ALGORITHMS:
+        content = read_yaml(shipped_folder() / f"{algo}.yml")
+        assert content["Hopper-v4"] == content["Hopper-v5"], algo
+
+
+@pytest.mark.parametrize("value", [float("inf"), "1e-3", [3e-4]])
+def test_a_number_may_be_text_but_nothing_else(value):
+    if value == "1e-3":  # zoo's inner quotes
+        assert decode(learning_rate=value)["learning_rate"] == 1e-3
+    else:
+        with pytest.raises(ConfigError):
+            decode(learning_rate=value)
