@@ -1,0 +1,259 @@
+"""Bad arguments: one clear line that names the argument and its value."""
+
+import math
+
+import numpy as np
+import pytest
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.her import HerReplayBuffer
+
+from sb3_symphony import REDQ, DroQ, Symphony
+from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
+
+
+def refused(build, name, value, *errors):
+    with pytest.raises(errors or (ValueError, TypeError)) as caught:
+        build(**{name: value})
+    message = str(caught.value)
+    assert name in message, message
+    assert repr(value) in message or str(value) in message, message
+    assert len(message.splitlines()) == 1, message
+    return message
+
+
+INTEGERS = dict(
+    buffer_size=(0, -1),
+    learning_starts=(-1,),
+    batch_size=(0, -5),
+    gradient_steps=(-2,),
+    n_steps=(0, -1),
+    n_critics=(0, -1),
+    policy_delay=(0, -1),
+)
+NUMBERS = dict(tau=(-0.1, 1.1), gamma=(-0.1, 1.1), learning_rate=(-1e-3,))
+WRONG = (math.nan, math.inf, -math.inf, True, "3", [1])
+
+CASES = [
+    *((name, value) for name, values in INTEGERS.items() for value in (*values, *WRONG, 1.5)),
+    *((name, value) for name, values in NUMBERS.items() for value in (*values, *WRONG)),
+]
+
+
+@pytest.mark.parametrize("name, value", CASES, ids=lambda x: str(x))
+def test_numbers(make, name, value):
+    refused(make, name, value)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("critic_learning_rate", -1e-3),
+        ("critic_learning_rate", math.nan),
+        ("critic_learning_rate", "1e-3"),
+        ("min_mix", -0.1),
+        ("min_mix", 1.1),
+        ("min_mix", math.nan),
+        ("min_mix", True),
+        ("min_mix", "1"),
+        ("episode_gradient_steps", -1),
+        ("episode_gradient_steps", 1.5),
+        ("episode_gradient_steps", True),
+        ("episode_gradient_steps", math.inf),
+        ("initial_gradient_steps", (1, 2, 3)),
+        ("initial_gradient_steps", (1,)),
+        ("initial_gradient_steps", 5),
+        ("warmup_policy", "acter"),
+        ("actor_loss", "rehea"),
+        ("action_noise", "defalt"),
+    ],
+    ids=str,
+)
+def test_symphony(small, name, value):
+    refused(lambda **kwargs: small(Symphony, **kwargs), name, value)
+
+
+@pytest.mark.parametrize("value, shown", [((-1, 2), "-1"), ((1, 2.5), "2.5"), ((True, 1), "True"), (("1", 2), "'1'")], ids=str)
+def test_initial_gradient_steps(small, value, shown):
+    with pytest.raises((ValueError, TypeError), match=f"initial_gradient_steps=.*{shown}"):
+        small(Symphony, initial_gradient_steps=value)
+
+
+@pytest.mark.parametrize("cls", [REDQ, DroQ])
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("subset_size", 0),
+        ("subset_size", 0.5),
+        ("subset_size", -1),
+        ("subset_size", 11),
+        ("subset_size", 3.5),
+        ("subset_size", math.nan),
+        ("subset_size", math.inf),
+        ("subset_size", True),
+        ("subset_size", "2"),
+        ("subset_size", "al"),
+        ("subset_size", None),
+        ("ent_coef", -0.1),
+        ("ent_coef", math.nan),
+        ("ent_coef", math.inf),
+        ("ent_coef", True),
+        ("ent_coef", None),
+        ("ent_coef", "automatic"),
+        ("ent_coef", "auto_x"),
+        ("ent_coef", "auto_-1"),
+        ("ent_coef", "auto_0"),
+        ("ent_coef", "auto_nan"),
+        ("target_entropy", math.nan),
+        ("target_entropy", math.inf),
+        ("target_entropy", True),
+        ("target_entropy", None),
+        ("target_entropy", "mbop"),
+    ],
+    ids=str,
+)
+def test_redq(small, cls, name, value):
+    refused(lambda **kwargs: small(cls, **kwargs), name, value)
+
+
+@pytest.mark.parametrize("cls", [REDQ, DroQ])
+def test_batch_size_is_needed(small, cls):
+    """Only Symphony's grows by itself."""
+    refused(lambda **kwargs: small(cls, **kwargs), "batch_size", None)
+
+
+def test_subset_larger_than_the_ensemble(small):
+    message = refused(lambda **kwargs: small(REDQ, n_critics=3, **kwargs), "subset_size", 4, ValueError)
+    assert "n_critics=3" in message
+
+
+def test_subset_of_critics_given_in_the_policy(small):
+    small(REDQ, subset_size=5, policy_kwargs=dict(n_critics=5))
+    with pytest.raises(ValueError, match="subset_size=5"):
+        small(REDQ, subset_size=5, policy_kwargs=dict(n_critics=4))
+
+
+@pytest.mark.parametrize(
+    "name, value, nearest",
+    [
+        ("target_mode", "mni", "min"),
+        ("target_mode", "maen", "mean"),
+        ("critic_loss", "hubre", "huber"),
+        ("critic_loss", "MSE", None),
+        ("critic_loss", "rehe_element", "rehe_elementwise"),
+        ("critic_loss", None, None),
+        ("target_mode", 3, None),
+    ],
+)
+def test_choices(make, name, value, nearest):
+    message = refused(make, name, value, ValueError)
+    if nearest is not None:
+        assert f"did you mean '{nearest}'?" in message
+
+
+@pytest.mark.parametrize("cls", [REDQ, DroQ])
+def test_reduction(small, cls):
+    message = refused(lambda **kwargs: small(cls, **kwargs), "critic_reduction", "ensemble_men", ValueError)
+    assert "did you mean 'ensemble_mean'?" in message
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("critic_engine", "fusd"),
+        ("dropout_rate", -0.1),
+        ("dropout_rate", 1.5),
+        ("dropout_rate", math.nan),
+        ("dropout_rate", True),
+        ("n_critics", 0),
+        ("n_critics", True),
+        ("n_critics", "2"),
+        ("n_critics", 2.5),
+    ],
+    ids=str,
+)
+def test_policy_arguments(make, name, value):
+    refused(lambda **kwargs: make(policy_kwargs=kwargs), name, value)
+
+
+@pytest.mark.parametrize("net_arch", [[0], [16, -1], [16.5], ["16"], [True]], ids=str)
+def test_net_arch(make, net_arch):
+    with pytest.raises((ValueError, TypeError), match="net_arch"):
+        make(policy_kwargs=dict(net_arch=net_arch))
+
+
+def test_unknown_policy_argument(make):
+    with pytest.raises(TypeError, match="no_such_argument"):
+        make(policy_kwargs=dict(no_such_argument=1))
+
+
+def test_unknown_argument(make):
+    with pytest.raises(TypeError, match="no_such_argument"):
+        make(no_such_argument=1)
+
+
+@pytest.mark.parametrize("train_freq", [0, -1, (0, "step"), (-1, "episode"), True], ids=str)
+def test_train_freq_must_be_positive(make, train_freq):
+    """SB3 itself notices at ``learn()``, by an assertion."""
+    with pytest.raises((ValueError, TypeError), match="train_freq"):
+        make(train_freq=train_freq)
+
+
+@pytest.mark.parametrize("train_freq", ["4", ([1], "step"), (1.5, "step"), (1, "steps"), (1, "")], ids=str)
+def test_train_freq(make, train_freq):
+    with pytest.raises((ValueError, TypeError), match="train_freq"):
+        make(train_freq=train_freq)
+
+
+@pytest.mark.parametrize("replay_buffer_class", [FadingReplayBuffer, PrioritizedReplayBuffer])
+def test_memory_optimisation_is_refused(make, replay_buffer_class):
+    with pytest.raises(ValueError, match="optimize_memory_usage"):
+        make(replay_buffer_class=replay_buffer_class, optimize_memory_usage=True)
+
+
+def test_memory_optimisation_of_symphonys_default_buffer(small):
+    with pytest.raises(ValueError, match="optimize_memory_usage"):
+        small(Symphony, optimize_memory_usage=True)
+
+
+def test_memory_optimisation_and_n_steps(make):
+    with pytest.raises(ValueError, match="optimize_memory_usage"):
+        make(optimize_memory_usage=True, n_steps=3)
+
+
+@pytest.mark.parametrize("fade_factor", [0, -1.0, math.nan])
+def test_fade_factor(make, fade_factor):
+    with pytest.raises(ValueError, match="fade_factor"):
+        make(replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=dict(fade_factor=fade_factor))
+
+
+def test_her_needs_dict_observations(make):
+    with pytest.raises((ValueError, TypeError, AssertionError)):
+        make(replay_buffer_class=HerReplayBuffer)
+
+
+def test_gsde_needs_a_stochastic_actor(small):
+    with pytest.raises(TypeError, match="use_sde"):
+        small(Symphony, use_sde=True)
+
+
+def test_numpy_numbers_are_numbers(make, algorithm):
+    extra = {} if algorithm is Symphony else dict(subset_size=np.int64(2))
+    make(
+        learning_rate=np.float64(1e-3),
+        buffer_size=np.int64(100),
+        batch_size=np.int32(8),
+        policy_delay=np.int64(2),
+        n_critics=np.int64(2),
+        gamma=np.float64(0.9),
+        **extra,
+    ).learn(30)
+
+
+def test_edges_are_allowed(make):
+    make(tau=0, gamma=1, learning_rate=0, learning_starts=0).learn(10)
+    make(tau=1.0, gamma=0.0, gradient_steps=-1, buffer_size=1, batch_size=1).learn(30)
+
+
+def test_noise_of_a_wrong_size(make):
+    with pytest.raises(ValueError):
+        make(action_noise=NormalActionNoise(np.zeros(3), np.ones(3))).learn(30)
