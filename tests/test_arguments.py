@@ -100,9 +100,6 @@ def test_initial_gradient_steps(small, value, shown):
         ("ent_coef", None),
         ("ent_coef", "automatic"),
         ("ent_coef", "auto_x"),
-        ("ent_coef", "auto_-1"),
-        ("ent_coef", "auto_0"),
-        ("ent_coef", "auto_nan"),
         ("target_entropy", math.nan),
         ("target_entropy", math.inf),
         ("target_entropy", True),
@@ -113,6 +110,13 @@ def test_initial_gradient_steps(small, value, shown):
 )
 def test_redq(small, cls, name, value):
     refused(lambda **kwargs: small(cls, **kwargs), name, value)
+
+
+@pytest.mark.parametrize("cls", [REDQ, DroQ])
+@pytest.mark.parametrize("ent_coef", ["auto_-1", "auto_0", "auto_nan", "auto_inf"])
+def test_initial_entropy_coefficient(small, cls, ent_coef):
+    with pytest.raises(ValueError, match=f"ent_coef='?(auto_)?{ent_coef.removeprefix('auto_')}"):
+        small(cls, ent_coef=ent_coef)
 
 
 @pytest.mark.parametrize("cls", [REDQ, DroQ])
