@@ -287,11 +287,12 @@ def test_time_limits_do_not_end_bootstrapping(make, algorithm, n_envs, replay_bu
 
 @pytest.mark.parametrize("terminates, value", [(True, 1.0), (False, 5.0)])
 def test_learned_value(make, algorithm, terminates, value):
-    """r / (1 - gamma) where time limits end the episodes, r where termination does."""
+    """r / (1 - gamma) where time limits end the episodes, r where termination does. The actor stays what has acted."""
     extra = dict(action_noise=None, critic_learning_rate=3e-3) if algorithm is Symphony else dict(ent_coef=0.0)
     env = make_vec_env(lambda: Constant(terminates))
     policy_kwargs = dict(dropout_rate=0.0)
-    model = make(env, gamma=0.8, tau=0.05, learning_rate=3e-3, policy_kwargs=policy_kwargs, **extra).learn(40)
+    extra.update(gamma=0.8, tau=0.05, learning_rate=3e-3, policy_delay=1_000_000)
+    model = make(env, policy_kwargs=policy_kwargs, **extra).learn(40)
     model.train(gradient_steps=800, batch_size=16)
     samples = model.replay_buffer.sample(100)
     with th.no_grad():
