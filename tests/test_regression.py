@@ -1,0 +1,371 @@
+import copy
+
+import pytest
+import torch as th
+from maths_helpers import OBS_DIM, assert_same_weights, batch_of, box, make_critic, perturb, separate_networks
+from stable_baselines3.common.envs import FakeImageEnv
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_symphony import REDQ, Symphony
+from sb3_symphony.common.layers import LeakySine
+from sb3_symphony.common.losses import CRITIC_LOSSES
+from sb3_symphony.common.regression import CriticRegression, FusedRegression, make_regression, not_fusable
+from sb3_symphony.redq.policies import REDQPolicy
+from sb3_symphony.symphony.policies import SymphonyPolicy
+
+TAU = 0.05
+UPDATES = 50
+
+
+class OwnReLU(nn.ReLU):
+    pass
+
+
+def regression(
+    engine,
+    loss="mse",
+    reduction="independent",
+    optimizer=th.optim.Adam,
+    dtype=th.float64,
+    learning_rate=3e-3,
+    fused=True,
+    seed=0,
+    optimizer_kwargs=None,
+    **kwargs,
+):
+    """A small regression; the same arguments give the same weights whatever the engine."""
+    th.manual_seed(seed)
+    critic, critic_target = make_critic(dtype=dtype, **kwargs), make_critic(dtype=dtype, **kwargs)
+    perturb(critic)
+    perturb(critic_target, seed=8)
+    flags = dict(fused=fused) if optimizer in (th.optim.Adam, th.optim.AdamW) else {}
+    critic.optimizer = optimizer(critic.parameters(), lr=learning_rate, **flags, **(optimizer_kwargs or {}))
+    critic.train()
+    return make_regression(critic, critic_target, loss, reduction, engine)
+
+
+def pair(fused_reference=False, **kwargs):
+    """Autograd with torch's textbook Adam, and the fused one."""
+    return regression("autograd", fused=fused_reference, **kwargs), regression("fused", **kwargs)
+
+
+def run(fitter, updates=UPDATES, sizes=(24,), dtype=th.float64, weighted=False, first=0, on_update=None):
+    fits = []
+    for i in range(first, first + updates):
+        observations, actions, target = batch_of(sizes[i * len(sizes) // UPDATES % len(sizes)], seed=i, dtype=dtype)
+        weights = th.rand(target.shape, generator=th.Generator().manual_seed(i), dtype=dtype) if weighted else None
+        if on_update is not None:
+            on_update(i, fitter)
+        fits.append(fitter.fit(observations, actions, target, TAU, weights))
+    return fits
+
+
+def state_of(fitter):
+    """All that an update changes, by name."""
+    critic = fitter.critic
+    state = {f"critic.{name}": value for name, value in critic.named_parameters()}
+    state.update({f"target.{name}": value for name, value in fitter.critic_target.named_parameters()})
+    for name, parameter in critic.named_parameters():
+        own = critic.optimizer.state[parameter]
+        assert set(own) == {"step", "exp_avg", "exp_avg_sq"}
+        state.update({f"{name}.{key}": value.double() for key, value in own.items()})
+    return {name: value.detach() for name, value in state.items()}
+
+
+def assert_equal_states(first, second, tolerance=1e-9):
+    first, second = state_of(first), state_of(second)
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        th.testing.assert_close(second[name], value, rtol=tolerance, atol=tolerance, msg=lambda m, name=name: f"{name}: {m}")
+
+
+def assert_equal_runs(reference, fused, tolerance=1e-9, **kwargs):
+    assert type(reference) is CriticRegression and type(fused) is FusedRegression
+    results = []
+    for fitter in (reference, fused):
+        before = [parameter.clone() for parameter in fitter.critic.parameters()]
+        th.manual_seed(1)  # of the dropout masks
+        results.append(run(fitter, **kwargs))
+        assert all(not th.equal(a, b) for a, b in zip(before, fitter.critic.parameters(), strict=True))
+    assert_equal_states(reference, fused, tolerance)
+    for one, other in zip(*results, strict=True):
+        assert one.loss.shape == other.loss.shape == () and one.q_values.shape == other.q_values.shape
+        assert not one.loss.requires_grad and not other.q_values.requires_grad
+        th.testing.assert_close(other.loss, one.loss, rtol=tolerance, atol=tolerance)
+        th.testing.assert_close(other.q_values, one.q_values, rtol=tolerance, atol=tolerance)
+
+
+# Fused = autograd, in double precision --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("activation_fn", [nn.ReLU, nn.ELU, nn.Tanh, nn.LeakyReLU, LeakySine, nn.Identity])
+@pytest.mark.parametrize("layer_norm", [False, True, [True, False]], ids=["plain", "norm", "first-norm"])
+@pytest.mark.parametrize("dropout_rate", [0.0, 0.3])
+def test_layers(activation_fn, layer_norm, dropout_rate):
+    kwargs = dict(activation_fn=activation_fn, layer_norm=layer_norm, dropout_rate=dropout_rate)
+    assert_equal_runs(*pair(**kwargs))
+
+
+@pytest.mark.parametrize("loss", CRITIC_LOSSES)
+@pytest.mark.parametrize("reduction", ["independent", "ensemble_mean"])
+@pytest.mark.parametrize("weighted", [False, True], ids=["plain", "weights"])
+def test_losses(loss, reduction, weighted):
+    assert_equal_runs(*pair(loss=loss, reduction=reduction), weighted=weighted)
+
+
+@pytest.mark.parametrize("optimizer", [th.optim.Adam, th.optim.AdamW])
+@pytest.mark.parametrize(
+    "optimizer_kwargs", [dict(weight_decay=0.05), dict(betas=(0.5, 0.9), eps=1e-3), dict(betas=(0.8, 0.99), weight_decay=0.1)]
+)
+def test_optimizers(optimizer, optimizer_kwargs):
+    assert_equal_runs(*pair(optimizer=optimizer, optimizer_kwargs=optimizer_kwargs))
+
+
+@pytest.mark.parametrize("net_arch", [[], [7], [16, 8, 12], [1, 1]], ids=str)
+@pytest.mark.parametrize("n_critics", [1, 2, 5])
+def test_shapes(net_arch, n_critics):
+    assert_equal_runs(*pair(net_arch=net_arch, n_critics=n_critics))
+
+
+def test_symphony_network():
+    kwargs = dict(activation_fn=[nn.Identity, LeakySine], layer_norm=[True, False], leaky_slope=0.2, loss="rehe", n_critics=2)
+    assert_equal_runs(*pair(**kwargs))
+
+
+@pytest.mark.parametrize("kwargs", [{}, dict(layer_norm=True, dropout_rate=0.2, activation_fn=LeakySine)])
+def test_batch_size_that_changes(kwargs):
+    assert_equal_runs(*pair(**kwargs), sizes=(24, 40, 1, 24))
+
+
+def test_learning_rate_that_changes():
+    def change(i, fitter):
+        for group in fitter.critic.optimizer.param_groups:
+            group["lr"] = 3e-3 if i < 20 else 1e-4
+
+    assert_equal_runs(*pair(), on_update=change)
+    constant, changed = regression("fused"), regression("fused")
+    run(constant)
+    run(changed, on_update=change)
+    assert not th.allclose(constant.critic.q_networks.layers[0].weight, changed.critic.q_networks.layers[0].weight)
+
+
+def test_targets_that_share_memory_with_nothing():
+    """What a fit returns, and its arguments, stay as they are when the next one runs."""
+    for engine in ("autograd", "fused"):
+        fitter = regression(engine)
+        observations, actions, target = batch_of(24)
+        copies = [x.clone() for x in (observations, actions, target)]
+        first = fitter.fit(observations, actions, target, TAU)
+        kept = first.loss.clone(), first.q_values.clone()
+        fitter.fit(*batch_of(24, seed=1), TAU)
+        assert th.equal(first.loss, kept[0]) and th.equal(first.q_values, kept[1])
+        assert all(th.equal(x, y) for x, y in zip(copies, (observations, actions, target), strict=True))
+
+
+def test_polyak_coefficients():
+    for tau in (0.0, 1.0):
+        for engine in ("autograd", "fused"):
+            fitter = regression(engine)
+            before = copy.deepcopy(fitter.critic_target.state_dict())
+            fitter.fit(*batch_of(24), tau)
+            wanted = before if tau == 0 else fitter.critic.state_dict()
+            for name, value in fitter.critic_target.state_dict().items():
+                th.testing.assert_close(value, wanted[name], rtol=1e-14, atol=1e-14)
+
+
+def test_polyak_of_the_reference():
+    for engine in ("autograd", "fused"):
+        fitter = regression(engine, net_arch=[], n_critics=1, learning_rate=0.0)
+        weight, target = fitter.critic.q_networks.layers[0].weight, fitter.critic_target.q_networks.layers[0].weight
+        weight.data[0, :3, 0] = th.tensor([2.0, -1.0, 0.5])
+        target.data[0, :3, 0] = th.tensor([1.0, -2.0, 0.5])
+        fitter.fit(*batch_of(8), 0.005)
+        assert target[0, :3, 0].tolist() == pytest.approx([1.005, -1.995, 0.5])
+        for _ in range(19):
+            fitter.fit(*batch_of(8), 0.005)
+        assert target[0, :3, 0].tolist() == pytest.approx([1.09538952, -1.90461048, 0.5])
+        fitter = regression(engine, net_arch=[], n_critics=1, learning_rate=0.0)
+        weight, target = fitter.critic.q_networks.layers[0].weight, fitter.critic_target.q_networks.layers[0].weight
+        weight.data.fill_(2.0)
+        target.data.fill_(1.0)
+        fitter.fit(*batch_of(8), 0.003)
+        assert target.flatten().tolist() == pytest.approx([1.003] * target.numel())
+
+
+# Single precision -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kwargs", [{}, dict(layer_norm=True, dropout_rate=0.1), dict(activation_fn=LeakySine, loss="rehe")])
+def test_single_precision(kwargs):
+    fitters = pair(dtype=th.float32, **kwargs)
+    for fitter in fitters:
+        th.manual_seed(1)
+        run(fitter, dtype=th.float32)
+    first, second = map(state_of, fitters)
+    for name, value in first.items():
+        assert second[name].dtype == value.dtype
+        assert th.norm(second[name] - value) <= 1e-3 * th.norm(value), name
+
+
+# State of the optimiser -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("before", "after"), [("autograd", "fused"), ("fused", "autograd")])
+@pytest.mark.parametrize("fused_reference", [False, True])
+def test_saved_by_one_engine_and_continued_by_the_other(before, after, fused_reference):
+    options = {"autograd": fused_reference, "fused": True}
+    straight = regression(before, fused=options[before])
+    run(straight, 40)
+    start = regression(before, fused=options[before])
+    run(start, 20)
+    continued = regression(after, fused=options[after], seed=5)  # other weights
+    continued.critic.load_state_dict(copy.deepcopy(start.critic.state_dict()))
+    continued.critic_target.load_state_dict(copy.deepcopy(start.critic_target.state_dict()))
+    continued.critic.optimizer.load_state_dict(copy.deepcopy(start.critic.optimizer.state_dict()))
+    run(continued, 20, first=20)
+    assert_equal_states(straight, continued)
+    assert {float(state["step"]) for state in continued.critic.optimizer.state.values()} == {40.0}
+
+
+def test_weights_loaded_between_updates_are_used():
+    """Loading writes into the parameters in place; the fused engine's workspaces must not hold copies of the old ones."""
+    reference, fused = pair()
+    for fitter in (reference, fused):
+        run(fitter, 5)
+        other = regression("autograd", seed=9)
+        fitter.critic.load_state_dict(other.critic.state_dict())
+        fitter.critic_target.load_state_dict(other.critic_target.state_dict())
+        run(fitter, 5, first=5)
+    assert_equal_states(reference, fused)
+
+
+@pytest.mark.parametrize("policy_class", [REDQPolicy, SymphonyPolicy])
+def test_optimizer_holds_the_parameters_in_their_order(policy_class):
+    policy = policy_class(box(OBS_DIM), box(2), lambda _: 1e-3, net_arch=[8, 8], n_critics=3, layer_norm=True)
+    (group,) = policy.critic.optimizer.param_groups
+    expected = list(policy.critic.parameters())
+    assert len(group["params"]) == len(expected) == 10
+    assert all(a is b for a, b in zip(group["params"], expected, strict=True))
+    assert group["lr"] == 1e-3
+
+
+# N separate networks --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["autograd", "fused"])
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("reduction", ["independent", "ensemble_mean"])
+def test_separate_networks_with_separate_optimizers(engine, layer_norm, reduction):
+    fitter = regression(engine, layer_norm=layer_norm, reduction=reduction, n_critics=4)
+    networks, targets = (separate_networks(critic.q_networks) for critic in (fitter.critic, fitter.critic_target))
+    optimizers = [th.optim.Adam(network.parameters(), lr=3e-3) for network in networks]
+    for i in range(5):
+        observations, actions, target = batch_of(24, seed=i)
+        fit = fitter.fit(observations, actions, target, TAU)
+
+        x = th.cat([observations.double(), actions], dim=1)
+        q_values = [network(x) for network in networks]
+        if reduction == "independent":
+            loss = sum(((target - q_value) ** 2).mean() for q_value in q_values)
+        else:
+            loss = ((target - sum(q_values) / 4) ** 2).mean()
+        for optimizer in optimizers:
+            optimizer.zero_grad()
+        loss.backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        with th.no_grad():
+            for network, slow in zip(networks, targets, strict=True):
+                for parameter, follower in zip(network.parameters(), slow.parameters(), strict=True):
+                    follower.copy_((1 - TAU) * follower + TAU * parameter)
+
+        assert fit.loss.item() == pytest.approx(loss.item(), rel=1e-10)
+        th.testing.assert_close(fit.q_values, th.stack(q_values).detach(), rtol=1e-10, atol=1e-10)
+    assert_same_weights(fitter.critic.q_networks, networks, 1e-10)
+    assert_same_weights(fitter.critic_target.q_networks, targets, 1e-10)
+
+
+@pytest.mark.parametrize(
+    ("reduction", "loss", "gradient"),
+    [("independent", 1.5, [[-1, 0], [-1, 1]]), ("ensemble_mean", 0.0625 * 2, [[-0.25, -0.25], [0, 0]])],
+)
+def test_critic_loss_of_the_reference(reduction, loss, gradient):
+    """``ensemble_mean`` without the factor 1/2 of the reference."""
+    fitter = regression("autograd", n_critics=2, reduction=reduction)
+    q_values = th.tensor([[1.0, 2.0], [3.0, 5.0]], dtype=th.float64).t()[..., None].clone().requires_grad_()
+    value = fitter._loss(q_values, th.tensor([[2.0], [4.0]], dtype=th.float64), None)
+    value.backward()
+    assert value.item() == pytest.approx(loss)
+    assert q_values.grad[..., 0].t().tolist() == gradient
+
+
+# Which engine ---------------------------------------------------------------------------------------------------------
+
+
+class OwnExtractor(BaseFeaturesExtractor):
+    def __init__(self, observation_space):
+        super().__init__(observation_space, 3)
+        self.linear = nn.Linear(3, 3)
+
+    def forward(self, observations):
+        return self.linear(observations)
+
+
+NOT_FUSABLE = [
+    (dict(optimizer_class=th.optim.SGD), "SGD"),
+    (dict(optimizer_class=th.optim.RMSprop), "RMSprop"),
+    (dict(activation_fn=OwnReLU), "OwnReLU"),
+    (dict(activation_fn=nn.SiLU), "SiLU"),
+    (dict(features_extractor_class=OwnExtractor), "OwnExtractor"),
+    (dict(optimizer_kwargs=dict(amsgrad=True)), "amsgrad"),
+    (dict(optimizer_kwargs=dict(maximize=True)), "maximize"),
+    (dict(optimizer_kwargs=dict(fused=False)), "fused=False"),
+]
+
+
+@pytest.mark.parametrize("cls", [REDQ, Symphony])
+@pytest.mark.parametrize(("policy_kwargs", "reason"), NOT_FUSABLE, ids=[reason for _, reason in NOT_FUSABLE])
+def test_what_cannot_be_fused(small, cls, policy_kwargs, reason):
+    with pytest.raises(ValueError, match=rf"critic_engine='fused'.*{reason}.*'auto' or 'autograd'"):
+        small(cls, policy_kwargs=dict(policy_kwargs, critic_engine="fused"))
+    for engine in ("auto", "autograd"):
+        model = small(cls, policy_kwargs=dict(policy_kwargs, critic_engine=engine))
+        assert type(model._regression) is CriticRegression
+        assert reason in not_fusable(model.critic)
+
+
+@pytest.mark.parametrize("cls", [REDQ, Symphony])
+def test_images_are_not_fused(small, cls):
+    env = FakeImageEnv(discrete=False, screen_height=36, screen_width=36)
+    with pytest.raises(ValueError, match="NatureCNN"):
+        small(cls, env, policy="CnnPolicy", policy_kwargs=dict(critic_engine="fused"))
+    assert type(small(cls, env, policy="CnnPolicy")._regression) is CriticRegression
+
+
+def test_choice_of_the_engine(small, algorithm):
+    assert type(small(algorithm)._regression) is FusedRegression
+    assert type(small(algorithm, policy_kwargs=dict(critic_engine="fused"))._regression) is FusedRegression
+    assert type(small(algorithm, policy_kwargs=dict(critic_engine="autograd"))._regression) is CriticRegression
+    adamw = small(algorithm, policy_kwargs=dict(optimizer_class=th.optim.AdamW, optimizer_kwargs=dict(weight_decay=0.01)))
+    assert type(adamw._regression) is FusedRegression
+    with pytest.raises(ValueError, match="critic_engine='fast'"):
+        small(algorithm, policy_kwargs=dict(critic_engine="fast"))
+
+
+@pytest.mark.parametrize("policy_kwargs", [{}, dict(dropout_rate=0.1, layer_norm=True)])
+def test_both_engines_learn_the_same(small, algorithm, policy_kwargs):
+    """A short run of each algorithm, in single precision."""
+    weights = []
+    for engine in ("autograd", "fused"):
+        model = small(algorithm, policy_kwargs=dict(policy_kwargs, critic_engine=engine)).learn(60)
+        assert type(model._regression) is (FusedRegression if engine == "fused" else CriticRegression)
+        weights.append({name: value.double() for name, value in model.policy.state_dict().items()})
+    for name, value in weights[0].items():
+        assert th.norm(weights[1][name] - value) <= 1e-3 * max(th.norm(value).item(), 1.0), name
+
+
+def test_gradients_of_a_fused_step_stay_out_of_grad():
+    fitter = regression("fused")
+    run(fitter, 2)
+    assert all(parameter.grad is None for parameter in fitter.critic.parameters())
