@@ -46,7 +46,9 @@ class SlowREDQ:
         self.columns, self.subset_size = columns, model.subset_size
         self.critics = separate_networks(model.critic.q_networks)
         self.targets = separate_networks(model.critic_target.q_networks)
-        self.actor = nn.ModuleDict({name: copy.deepcopy(getattr(model.actor, name)) for name in ("latent_pi", "mu", "log_std")})
+        self.actor = nn.ModuleDict(
+            {name: copy.deepcopy(getattr(model.actor, name)) for name in ("latent_pi", "mu", "log_std")}
+        )
         self.log_ent_coef = model.log_ent_coef.detach().clone().requires_grad_()
         self.critic_optimizers = [th.optim.Adam(critic.parameters(), lr=LEARNING_RATE) for critic in self.critics]
         self.actor_optimizer = th.optim.Adam(self.actor.parameters(), lr=LEARNING_RATE)
@@ -66,6 +68,8 @@ class SlowREDQ:
                 self.actor_update(batch)
 
     def critic_update(self, batch):
+        if self.subset_size < len(self.critics):
+            np.random.random()  # the coin of fractional sizes
         subset = np.random.permutation(len(self.critics))[: self.subset_size]
         with th.no_grad():
             action, log_prob = squashed_gaussian(self.actor, batch["next_observations"])
