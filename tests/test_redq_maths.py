@@ -219,7 +219,7 @@ def test_target_of_the_reference(monkeypatch, target_mode, subset, expected):
     assert recorded[0].flatten().tolist() == pytest.approx(expected)
 
 
-def add_same(model, n, reward, terminated, truncated, n_steps=1):
+def add_same(model, n, reward, terminated, truncated):
     """``n`` transitions with the same next observation."""
     model.replay_buffer.reset()
     rng = np.random.default_rng(0)
