@@ -246,7 +246,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         if self.warmup_policy == "actor" and self.num_timesteps < learning_starts:
-            if self._redraw_actor:
+            if self._redraw_actor and self._n_updates == 0:  # never a trained one, when learn() starts counting anew
                 self.actor.redraw()
                 self._redraw_actor = False
             learning_starts = 0  # the actor acts, with noise
