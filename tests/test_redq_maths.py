@@ -443,7 +443,7 @@ def test_dropout_in_the_targets(monkeypatch, cls, active):
     model.actor.log_std.bias.data.fill_(-20)
     recorded = record_targets(model, monkeypatch)
     model.train(1, 16)
-    assert model.critic_target.training is active
+    assert model.critic_target.q_networks.training is active
     spread = recorded[0].std().item()
     assert (spread > 1e-3) is active
     model.predict(np.zeros(3, np.float32))

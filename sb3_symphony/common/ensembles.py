@@ -44,10 +44,9 @@ def hidden_layers(
     :return: One entry per width
     :raises ValueError: if a width, the rate or the slope is out of range
     """
+    check_net_arch(net_arch)
     check_number("dropout_rate", dropout_rate, 0, 1)
     check_number("leaky_slope", leaky_slope, 0)
-    for width in net_arch:
-        check_number("net_arch", width, 1, integer=True)
 
     def at(values: T | Sequence[T], i: int) -> T:
         return values[min(i, len(values) - 1)] if isinstance(values, Sequence) else values
@@ -57,6 +56,17 @@ def hidden_layers(
         HiddenLayer(width, partial(LeakySine, leaky_slope) if cls is LeakySine else cls, at(layer_norm, i), dropout_rate)
         for i, (width, cls) in enumerate(zip(net_arch, activations, strict=True))
     ]
+
+
+def check_net_arch(net_arch: list[int] | dict[str, list[int]] | None) -> None:
+    """
+    :param net_arch: Widths of hidden layers, or a dict of such lists
+    :raises ValueError: if a width is out of range
+    :raises TypeError: if a width is no whole number
+    """
+    for widths in net_arch.values() if isinstance(net_arch, dict) else [net_arch or []]:
+        for width in widths:
+            check_number("net_arch", width, 1, integer=True)
 
 
 def adam_defaults(optimizer_class: type[th.optim.Optimizer]) -> dict[str, bool]:

@@ -39,7 +39,7 @@ class DecayingActionNoise(ActionNoise):
     linear s = 1 - t/T (both 0 from t = T on), tanh s = 1 - tanh(t/T) (never quite 0), constant s = 1.
     The end of an episode (``reset()``) restarts a subclass's correlation, not the decay.
 
-    :param n_actions: number of action dimensions
+    :param n_actions: number of action dimensions, or the action space's shape
     :param sigma: initial standard deviation, in scaled action units, >= 0
     :param sigma_final: last standard deviation, >= 0
     :param decay_steps: T, in environment steps, > 0
@@ -51,7 +51,7 @@ class DecayingActionNoise(ActionNoise):
 
     def __init__(
         self,
-        n_actions: int,
+        n_actions: int | tuple[int, ...],
         sigma: float,
         sigma_final: float,
         decay_steps: float,
@@ -59,14 +59,16 @@ class DecayingActionNoise(ActionNoise):
         n_envs: int,
     ) -> None:
         super().__init__()
-        _count("n_actions", n_actions)
+        self.shape = n_actions if isinstance(n_actions, tuple) else (n_actions,)
+        for size in self.shape:
+            _count("n_actions", size)
         _at_least("sigma", sigma, 0)
         _at_least("sigma_final", sigma_final, 0)
         _positive("decay_steps", decay_steps)
         if decay not in DECAYS:
             raise ValueError(f"decay={decay!r}: expected one of {', '.join(DECAYS)}")
         _count("n_envs", n_envs)
-        self.n_actions = n_actions
+        self.n_actions = math.prod(self.shape)
         self.sigma = sigma
         self.sigma_final = sigma_final
         self.decay_steps = decay_steps
@@ -92,11 +94,11 @@ class DecayingActionNoise(ActionNoise):
 
     def __call__(self) -> np.ndarray:
         """
-        :return: noise of one environment step, float32 ``(n_actions,)``, in scaled action units
+        :return: noise of one environment step, float32 ``(n_actions,)`` or the given shape, in scaled action units
         """
         noise = self._draw(self.sigma_t)
         self.t += self.n_envs
-        return noise.astype(np.float32)
+        return noise.astype(np.float32).reshape(self.shape)
 
     @abstractmethod
     def _draw(self, sigma: float) -> np.ndarray:
@@ -120,7 +122,7 @@ class DecayingNormalActionNoise(DecayingActionNoise):
     (which lowers the standard deviation by 2 %). Source: Read, "Dancing like the Inbetweeners: learning to walk with
     Symphony" (2024), with the numbers of the original author's code.
 
-    :param n_actions: number of action dimensions
+    :param n_actions: number of action dimensions, or the action space's shape
     :param sigma: initial standard deviation, in scaled action units, >= 0
     :param sigma_final: last standard deviation, >= 0
     :param decay_steps: length of the decay, in environment steps, > 0
@@ -132,7 +134,7 @@ class DecayingNormalActionNoise(DecayingActionNoise):
 
     def __init__(
         self,
-        n_actions: int,
+        n_actions: int | tuple[int, ...],
         sigma: float = 0.3,
         sigma_final: float = 0.0,
         decay_steps: float = 104_720,
@@ -159,7 +161,7 @@ class StickyActionNoise(DecayingActionNoise):
     x starts from its stationary distribution N(0, 1) at every episode, so the standard deviation is σ_t at all times.
     Correlated noise moves a robot's limbs somewhere; independent noise averages out before they have moved.
 
-    :param n_actions: number of action dimensions
+    :param n_actions: number of action dimensions, or the action space's shape
     :param sigma: initial standard deviation, in scaled action units, >= 0
     :param sigma_final: last standard deviation, >= 0
     :param decay_steps: length of the decay, in environment steps, > 0
@@ -172,7 +174,7 @@ class StickyActionNoise(DecayingActionNoise):
 
     def __init__(
         self,
-        n_actions: int,
+        n_actions: int | tuple[int, ...],
         sigma: float = 0.3,
         sigma_final: float = 0.0,
         decay_steps: float = 104_720,
@@ -214,7 +216,7 @@ class PinkActionNoise(DecayingActionNoise):
 
     Source: Eberhard et al., "Pink Noise Is All You Need: Colored Noise Exploration in Deep Reinforcement Learning" (2023).
 
-    :param n_actions: number of action dimensions
+    :param n_actions: number of action dimensions, or the action space's shape
     :param sigma: initial standard deviation, in scaled action units, >= 0
     :param sigma_final: last standard deviation, >= 0
     :param decay_steps: length of the decay, in environment steps, > 0
@@ -227,7 +229,7 @@ class PinkActionNoise(DecayingActionNoise):
 
     def __init__(
         self,
-        n_actions: int,
+        n_actions: int | tuple[int, ...],
         sigma: float = 0.3,
         sigma_final: float = 0.0,
         decay_steps: float = 104_720,
@@ -294,7 +296,7 @@ class DisturbanceActionNoise(DecayingActionNoise):
     Source: the third version of Symphony by its original author (2024), which uses σ_t = 1 - tanh(3.07e-5·t), the
     default here; its residual disturbance tr is ``sigma=1 + tr, sigma_final=tr``.
 
-    :param n_actions: number of action dimensions
+    :param n_actions: number of action dimensions, or the action space's shape
     :param sigma: initial amplitude, in scaled action units, in [0, 2] (a stronger leak would make d diverge)
     :param sigma_final: last amplitude, in [0, 2]
     :param decay_steps: length of the decay, in environment steps, > 0
@@ -308,7 +310,7 @@ class DisturbanceActionNoise(DecayingActionNoise):
 
     def __init__(
         self,
-        n_actions: int,
+        n_actions: int | tuple[int, ...],
         sigma: float = 1.0,
         sigma_final: float = 0.0,
         decay_steps: float = 1 / 3.07e-5,

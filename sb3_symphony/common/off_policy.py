@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
 
 from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number
@@ -60,7 +60,8 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         **kwargs: Any,
     ) -> None:
         policy_kwargs = dict(policy_kwargs or {})  # the caller's own stays as it is
-        default = inspect.signature(type(self)).parameters["n_critics"].default
+        signatures = (inspect.signature(base).parameters for base in type(self).__mro__)
+        default = next(parameters["n_critics"].default for parameters in signatures if "n_critics" in parameters)
         in_policy = policy_kwargs.setdefault("n_critics", n_critics)
         if n_critics not in (default, in_policy):
             raise ValueError(f"n_critics={n_critics!r}, but policy_kwargs has n_critics={in_policy!r}: give one of them")
@@ -84,8 +85,12 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         check_number("learning_starts", self.learning_starts, 0, integer=True)
         if self.batch_size is not None:
             check_number("batch_size", self.batch_size, 1, integer=True)
+            self.batch_size = int(self.batch_size)
         check_number("tau", self.tau, 0, 1)
         check_number("gamma", self.gamma, 0, 1)
+        if not isinstance(self.train_freq, TrainFreq):
+            frequency = self.train_freq[0] if isinstance(self.train_freq, tuple) else self.train_freq
+            check_number("train_freq", frequency, 1, integer=True)
         check_number("gradient_steps", self.gradient_steps, -1, integer=True)
         check_number("n_steps", self.n_steps, 1, integer=True)
         check_number("n_critics", self.n_critics, 1, integer=True)

@@ -9,7 +9,7 @@ from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
 from sb3_symphony.common.checks import check_choice
-from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults
+from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults, check_net_arch
 from sb3_symphony.common.regression import ENGINES
 
 
@@ -73,6 +73,7 @@ class REDQPolicy(SACPolicy):
         critic_engine: str = "auto",
     ) -> None:
         check_choice("critic_engine", critic_engine, ENGINES)
+        check_net_arch(net_arch)  # before the parent, which builds the actor
         self.critic_engine = critic_engine
         self.layer_norm, self.dropout_rate = layer_norm, dropout_rate  # before the parent, which builds the networks
         super().__init__(
@@ -110,11 +111,12 @@ class REDQPolicy(SACPolicy):
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
         # SB3 keeps targets in evaluation mode; DroQ's dropout is active in them too
-        self.critic_target.set_training_mode(mode and self.dropout_rate > 0)
+        self.critic_target.q_networks.train(mode and self.dropout_rate > 0)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, critic_engine=self.critic_engine)
+        data.update(share_features_extractor=self.share_features_extractor)  # which SACPolicy leaves out
         return data
 
 

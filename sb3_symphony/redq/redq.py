@@ -148,6 +148,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
         )
+        check_number("batch_size", batch_size, 1, integer=True)
         self.subset_size = subset_size
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
@@ -164,12 +165,16 @@ class REDQ(EnsembleOffPolicyAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.target_entropy = self._resolve_target_entropy()
-        learned = isinstance(self.ent_coef, str) and self.ent_coef.partition("_")[0] == "auto"
-        initial = (self.ent_coef.partition("_")[2] or 1.0) if learned else self.ent_coef  # type: ignore[union-attr]
-        try:
-            initial = float(initial)
-        except ValueError:
-            raise ValueError(f"ent_coef={self.ent_coef!r}: expected a number, 'auto' or 'auto_<initial value>'") from None
+        learned = False
+        initial: float | None
+        if isinstance(self.ent_coef, str):
+            kind, _, start = self.ent_coef.partition("_")
+            learned = kind == "auto"
+            initial = _number((start or "1") if learned else self.ent_coef)
+        else:
+            initial = self.ent_coef
+        if initial is None:
+            raise ValueError(f"ent_coef={self.ent_coef!r}: expected a number, 'auto' or 'auto_<initial value>'")
         check_number("ent_coef", initial, 0, exclusive=learned)
         if learned:
             # The log is optimised, as in SB3
@@ -185,12 +190,11 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             return MBPO_TARGET_ENTROPY.get(name, -float(get_action_dim(self.action_space)))
         if self.target_entropy in ("auto", "mbpo"):
             return -float(get_action_dim(self.action_space))
-        try:
-            value = float(self.target_entropy)
-        except ValueError:
-            raise ValueError(f"target_entropy={self.target_entropy!r}: expected a number, 'auto' or 'mbpo'") from None
+        value = _number(self.target_entropy) if isinstance(self.target_entropy, str) else self.target_entropy
+        if value is None:
+            raise ValueError(f"target_entropy={self.target_entropy!r}: expected a number, 'auto' or 'mbpo'")
         check_number("target_entropy", value)
-        return value
+        return float(value)
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
         # Switch to train mode (this affects dropout, in the targets too)
@@ -231,9 +235,11 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             if self._n_updates % self.policy_delay == 0:
                 self._update_actor(batches[-1], ent_coef, logs)
 
-        # Of the untransformed Gaussian that acted last
-        noise_std = self.actor.action_dist.distribution.stddev.detach().mean()
-        self._log_update(n_updates_before, logs, noise_std)
+        action_dist = self.actor.action_dist
+        self._log_update(n_updates_before, logs, noise_std=action_dist.distribution.stddev.detach().mean())
+        for name in ("distribution", "gaussian_actions", "_latent_sde"):
+            if hasattr(action_dist, name):
+                setattr(action_dist, name, None)  # they hold the last graph, and a policy with one cannot be copied
 
     def _update_actor(self, batch: ReplayBufferSamples, ent_coef: th.Tensor, logs: dict[str, list[th.Tensor]]) -> None:
         """One step of the actor toward the mean of all critics, then one of the entropy coefficient."""
@@ -289,3 +295,10 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         if self.ent_coef_optimizer is None:
             return state_dicts, [*tensors, "ent_coef_tensor"]
         return [*state_dicts, "ent_coef_optimizer"], [*tensors, "log_ent_coef"]
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

@@ -168,7 +168,7 @@ class SymphonyPolicy(TD3Policy):
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
         # SB3 keeps targets in evaluation mode; dropout is active in them too, as in DroQ
-        self.critic_target.set_training_mode(mode and self.dropout_rate > 0)
+        self.critic_target.q_networks.train(mode and self.dropout_rate > 0)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()

@@ -6,7 +6,6 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
@@ -40,7 +39,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param tau: The soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: The discount factor
     :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(2, "episode")``
-    :param gradient_steps: Updates after each rollout; -1: as many as steps were collected.
+    :param gradient_steps: Updates after each rollout; -1: as many as steps were collected. 0 switches all updates off,
+        those at an episode's start too.
         With several environments one vector step counts as one: multiply by ``n_envs`` for the same update ratio
     :param action_noise: Exploration noise. ``"default"``: Gaussian with a standard deviation that falls from 0.3 to 0
         along a cosine within 104,720 steps, clipped at 2.5 standard deviations
@@ -147,7 +147,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self.critic_learning_rate = critic_learning_rate
         self.min_mix = min_mix
         self.actor_loss = actor_loss
-        self.initial_gradient_steps = tuple(initial_gradient_steps)
+        self.initial_gradient_steps = initial_gradient_steps
         self.episode_gradient_steps = episode_gradient_steps
         self.warmup_policy = warmup_policy
 
@@ -155,9 +155,9 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             check_number("critic_learning_rate", critic_learning_rate, 0)
         check_number("min_mix", min_mix, 0, 1)
         check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
-        if len(self.initial_gradient_steps) != 2:
+        if not isinstance(initial_gradient_steps, (tuple, list)) or len(initial_gradient_steps) != 2:
             raise ValueError(f"initial_gradient_steps={initial_gradient_steps!r}: expected two numbers (uniform, faded)")
-        for n_updates in self.initial_gradient_steps:
+        for n_updates in initial_gradient_steps:
             check_number("initial_gradient_steps", n_updates, 0, integer=True)
         check_number("episode_gradient_steps", episode_gradient_steps, 0, integer=True)
         check_choice("warmup_policy", warmup_policy, ("actor", "uniform"))
@@ -176,7 +176,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
         self.critic_lr_schedule = FloatSchedule(rate)
         if isinstance(self.action_noise, str):
-            self.action_noise = DecayingNormalActionNoise(get_action_dim(self.action_space))
+            self.action_noise = DecayingNormalActionNoise(self.action_space.shape)
         # Mean value at the previous update, which the actor's loss compares with
         self.baseline = th.zeros((), device=self.device)
 
