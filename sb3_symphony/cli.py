@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
+from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import (
     ConfigError,
     TrainOptions,
@@ -14,7 +15,7 @@ from sb3_symphony.experiment.config import (
     shipped_environments,
     validated,
 )
-from sb3_symphony.experiment.registry import ALGORITHMS, suggestion
+from sb3_symphony.experiment.registry import ALGORITHMS
 
 _TRAIN_EXAMPLES = """examples:
   sb3-symphony train                                  Symphony learns to walk

@@ -10,6 +10,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_symphony.common.buffers import FadingReplayBuffer
+from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.noise import StickyActionNoise
 from sb3_symphony.common.wrappers import RewardFloor
 from sb3_symphony.experiment.config import (
@@ -27,7 +28,7 @@ from sb3_symphony.experiment.config import (
 )
 from sb3_symphony.experiment.decode import algorithm_arguments, argument_types, class_by_name
 from sb3_symphony.experiment.environment import find_wrapper, split_wrappers
-from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm, suggestion
+from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
 
 ACTIONS = spaces.Box(-1.0, 1.0, (4,))
 

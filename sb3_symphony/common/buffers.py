@@ -17,6 +17,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_symphony.common.checks import check_number
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Fading: weights and exact draws
 # ----------------------------------------------------------------------------------------------------------------------
@@ -25,8 +27,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 def _check_fading(fade_factor: float | None, fade_power: float) -> None:
     if fade_factor is not None and not fade_factor > 0:  # written so that NaN is refused too
         raise ValueError(f"fade_factor={fade_factor!r}: expected a number > 0, or None (or inf) for uniform sampling")
-    if not (fade_power > 0 and math.isfinite(fade_power)):
-        raise ValueError(f"fade_power={fade_power!r}: expected a finite number > 0")
+    check_number("fade_power", fade_power, 0, exclusive=True)
 
 
 def _is_uniform(fade_factor: float | None) -> bool:
@@ -113,10 +114,8 @@ class _StepsReplayBuffer(NStepReplayBuffer):
     """SB3's n-step buffer, except that one step gives exactly the samples of SB3's plain buffer (no discounts)."""
 
     def __init__(self, *args: Any, n_steps: int = 1, gamma: float = 0.99, **kwargs: Any) -> None:
-        if isinstance(n_steps, bool) or not isinstance(n_steps, int | np.integer) or n_steps < 1:
-            raise ValueError(f"n_steps={n_steps!r}: expected an integer >= 1")
-        if not 0 <= gamma <= 1:
-            raise ValueError(f"gamma={gamma!r}: expected a number in [0, 1]")
+        check_number("n_steps", n_steps, 1, integer=True)
+        check_number("gamma", gamma, 0, 1)
         super().__init__(*args, n_steps=n_steps, gamma=gamma, **kwargs)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
@@ -396,11 +395,9 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
         _refuse_memory_optimisation("PrioritizedReplayBuffer", optimize_memory_usage)
         if isinstance(observation_space, spaces.Dict):
             raise ValueError("PrioritizedReplayBuffer does not hold Dict observations: use FadingDictReplayBuffer")
-        for name, value in (("alpha", alpha), ("beta", beta)):
-            if not (value >= 0 and math.isfinite(value)):
-                raise ValueError(f"{name}={value!r}: expected a finite number >= 0")
-        if not (eps > 0 and math.isfinite(eps)):
-            raise ValueError(f"eps={eps!r}: expected a finite number > 0")
+        check_number("alpha", alpha, 0)
+        check_number("beta", beta, 0)
+        check_number("eps", eps, 0, exclusive=True)
         super().__init__(
             buffer_size,
             observation_space,

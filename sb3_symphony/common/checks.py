@@ -48,11 +48,12 @@ def check_choice(name: str, value: Any, options: Iterable[Any]) -> None:
 
 def suggestion(value: Any, options: Iterable[Any]) -> str:
     """
-    The end of an error message that suggests the nearest spelling.
+    The end of an error message that suggests the nearest spelling, upper and lower case apart.
 
     :param value: What was given
     :param options: What is known
     :return: ``": did you mean 'x'?"``, or ``""`` if nothing is near
     """
-    nearest = difflib.get_close_matches(str(value), [str(option) for option in options], n=1)
-    return f": did you mean {nearest[0]!r}?" if nearest else ""
+    by_lower = {str(option).lower(): option for option in options}
+    nearest = difflib.get_close_matches(str(value).lower(), by_lower, n=1)
+    return f": did you mean {by_lower[nearest[0]]!r}?" if nearest else ""

@@ -13,22 +13,9 @@ from abc import abstractmethod
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 
+from sb3_symphony.common.checks import check_choice, check_number
+
 DECAYS = ("cosine", "linear", "tanh", "constant")
-
-
-def _at_least(name: str, value: float, minimum: float) -> None:
-    if not (math.isfinite(value) and value >= minimum):
-        raise ValueError(f"{name}={value!r}: expected a finite number >= {minimum:g}")
-
-
-def _positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name}={value!r}: expected a finite number > 0")
-
-
-def _count(name: str, value: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name}={value!r}: expected an integer >= 1")
 
 
 class DecayingActionNoise(ActionNoise):
@@ -61,13 +48,12 @@ class DecayingActionNoise(ActionNoise):
         super().__init__()
         self.shape = n_actions if isinstance(n_actions, tuple) else (n_actions,)
         for size in self.shape:
-            _count("n_actions", size)
-        _at_least("sigma", sigma, 0)
-        _at_least("sigma_final", sigma_final, 0)
-        _positive("decay_steps", decay_steps)
-        if decay not in DECAYS:
-            raise ValueError(f"decay={decay!r}: expected one of {', '.join(DECAYS)}")
-        _count("n_envs", n_envs)
+            check_number("n_actions", size, 1, integer=True)
+        check_number("sigma", sigma, 0)
+        check_number("sigma_final", sigma_final, 0)
+        check_number("decay_steps", decay_steps, 0, exclusive=True)
+        check_choice("decay", decay, DECAYS)
+        check_number("n_envs", n_envs, 1, integer=True)
         self.n_actions = math.prod(self.shape)
         self.sigma = sigma
         self.sigma_final = sigma_final
@@ -144,7 +130,7 @@ class DecayingNormalActionNoise(DecayingActionNoise):
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
         if clip is not None:
-            _positive("clip", clip)
+            check_number("clip", clip, 0, exclusive=True)
         self.clip = clip
 
     def _draw(self, sigma: float) -> np.ndarray:
@@ -186,7 +172,7 @@ class StickyActionNoise(DecayingActionNoise):
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
         if not 0 <= correlation < 1:
             raise ValueError(f"correlation={correlation!r}: expected a number in [0, 1)")
-        _count("hold", hold)
+        check_number("hold", hold, 1, integer=True)
         self.correlation = correlation
         self.hold = hold
         self.reset()
@@ -239,10 +225,8 @@ class PinkActionNoise(DecayingActionNoise):
         n_envs: int = 1,
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
-        _at_least("beta", beta, 0)
-        _count("block_steps", block_steps)
-        if block_steps < 2:
-            raise ValueError(f"block_steps={block_steps!r}: expected an integer >= 2")
+        check_number("beta", beta, 0)
+        check_number("block_steps", block_steps, 2, integer=True)
         self.beta = beta
         self.block_steps = block_steps
         self.reset()
@@ -318,9 +302,8 @@ class DisturbanceActionNoise(DecayingActionNoise):
         n_envs: int = 1,
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
-        for name, value in (("sigma", sigma), ("sigma_final", sigma_final)):
-            if value > 2:
-                raise ValueError(f"{name}={value!r}: expected a number in [0, 2]")
+        check_number("sigma", sigma, 0, 2)
+        check_number("sigma_final", sigma_final, 0, 2)
         self.clock = 0.0
         self.reset()
 

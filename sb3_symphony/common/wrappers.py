@@ -14,6 +14,8 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
+from sb3_symphony.common.checks import check_choice, check_number
+
 
 def _find_wrapper(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> Any:
     """The outermost wrapper of that class around ``env``, or None."""
@@ -22,12 +24,6 @@ def _find_wrapper(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> Any:
             return env
         env = env.env
     return None
-
-
-def _finite(name: str, value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError(f"{name}={value!r}: expected a finite number")
-    return float(value)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -137,7 +133,8 @@ class RewardFloor(LearningReward):
     """
 
     def __init__(self, env: gym.Env, floor: float = -10.0) -> None:
-        self.floor = _finite("floor", floor)
+        check_number("floor", floor)
+        self.floor = float(floor)
         super().__init__(env)
 
     def learning_reward(self, observation: Any, reward: float) -> float:
@@ -154,8 +151,7 @@ class RewardScale(LearningReward):
     """
 
     def __init__(self, env: gym.Env, scale: float) -> None:
-        if not (scale > 0 and math.isfinite(scale)):
-            raise ValueError(f"scale={scale!r}: expected a finite number > 0")
+        check_number("scale", scale, 0, exclusive=True)
         self.scale = float(scale)
         super().__init__(env)
 
@@ -173,7 +169,8 @@ class RewardBonus(LearningReward):
     """
 
     def __init__(self, env: gym.Env, bonus: float = 1.0) -> None:
-        self.bonus = _finite("bonus", bonus)
+        check_number("bonus", bonus)
+        self.bonus = float(bonus)
         super().__init__(env)
 
     def learning_reward(self, observation: Any, reward: float) -> float:
@@ -197,10 +194,8 @@ class StallPenalty(LearningReward):
     """
 
     def __init__(self, env: gym.Env, coef: float = 0.07, kind: str = "B") -> None:
-        if not (coef >= 0 and math.isfinite(coef)):
-            raise ValueError(f"coef={coef!r}: expected a finite number >= 0")
-        if kind not in ("A", "B"):
-            raise ValueError(f"kind={kind!r}: expected 'A' or 'B'")
+        check_number("coef", coef, 0)
+        check_choice("kind", kind, ("A", "B"))
         if not isinstance(env.observation_space, gym.spaces.Box):
             raise TypeError(f"StallPenalty: expected a Box observation space, got {env.observation_space}")
         self.coef = float(coef)
@@ -247,10 +242,8 @@ class EpisodeStepLimit(gym.Wrapper):
     """
 
     def __init__(self, env: gym.Env, max_steps: int, until_total_steps: int) -> None:
-        if not max_steps >= 1:
-            raise ValueError(f"max_steps={max_steps!r}: expected an integer >= 1")
-        if not until_total_steps >= 0:
-            raise ValueError(f"until_total_steps={until_total_steps!r}: expected an integer >= 0")
+        check_number("max_steps", max_steps, 1, integer=True)
+        check_number("until_total_steps", until_total_steps, 0, integer=True)
         super().__init__(env)
         self.max_steps = max_steps
         self.until_total_steps = until_total_steps
@@ -310,8 +303,7 @@ class TorsoMass(gym.Wrapper):
     """
 
     def __init__(self, env: gym.Env, mass: float) -> None:
-        if not (mass > 0 and math.isfinite(mass)):
-            raise ValueError(f"mass={mass!r}: expected a finite number > 0, in kg")
+        check_number("mass", mass, 0, exclusive=True)  # kg
         model: Any = getattr(env.unwrapped, "model", None)
         if not hasattr(model, "body_mass"):
             raise TypeError(f"TorsoMass: {env} is not a MuJoCo environment")

@@ -17,7 +17,8 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
-from sb3_symphony.experiment.registry import ALGORITHMS, suggestion
+from sb3_symphony.common.checks import suggestion
+from sb3_symphony.experiment.registry import ALGORITHMS
 
 
 class ConfigError(ValueError):

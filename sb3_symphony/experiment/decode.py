@@ -18,8 +18,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError, RunConfig, RunSettings
-from sb3_symphony.experiment.registry import suggestion
 
 _SB3 = "stable_baselines3.common"
 _OURS = "sb3_symphony.common"

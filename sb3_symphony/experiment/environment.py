@@ -16,10 +16,10 @@ from stable_baselines3.common.env_util import make_vec_env, unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
+from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
 from sb3_symphony.experiment.config import ConfigError, RunSettings
 from sb3_symphony.experiment.decode import typed_arguments
-from sb3_symphony.experiment.registry import suggestion
 
 #: evaluation episode i runs on environment seed 10 000 + i
 EVALUATION_SEED = 10_000

@@ -1,7 +1,5 @@
 """All algorithms by name. Nothing heavy is imported before :func:`load_algorithm` asks for a class."""
 
-import difflib
-from collections.abc import Iterable
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -21,19 +19,6 @@ ALGORITHMS: dict[str, tuple[str, str, str]] = {
     "tqc": ("sb3_contrib", "TQC", "truncated quantile critics"),
     "crossq": ("sb3_contrib", "CrossQ", "batch-normalised critics without target networks"),
 }
-
-
-def suggestion(name: str, choices: Iterable[str]) -> str:
-    """
-    The end of an error message: the nearest valid spelling, if one is near.
-
-    :param name: what was given
-    :param choices: valid names
-    :return: ``": did you mean 'x'?"`` or an empty string
-    """
-    by_lower = {choice.lower(): choice for choice in choices}
-    near = difflib.get_close_matches(name.lower(), by_lower, n=1)
-    return f": did you mean '{by_lower[near[0]]}'?" if near else ""
 
 
 def load_algorithm(name: str) -> type["BaseAlgorithm"]:
