@@ -152,8 +152,8 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         """
         Draw ``gradient_steps`` minibatches and cut them where the actor changes.
 
-        Inside a segment the actor is frozen, so its next actions can be computed for all minibatches at once. A segment
-        ends before every ``policy_delay``-th update (counted over the model's life) has been followed by an actor step.
+        A segment ends with every ``policy_delay``-th update (counted over the model's life), after which the caller steps
+        the actor. Inside it the actor is frozen, so its next actions can be computed for all minibatches at once.
 
         :param gradient_steps: Number of critic updates
         :param batch_size: Transitions per update
