@@ -256,3 +256,13 @@ def test_a_number_may_be_text_but_nothing_else(value):
     else:
         with pytest.raises(ConfigError):
             decode(learning_rate=value)
+
+
+def test_presets_are_found_by_name():
+    presets = [path.stem for path in (shipped_folder() / "presets").glob("*.yml")]
+    assert {"symphony-original", "symphony-enhanced"} <= set(presets)
+    for name in presets:
+        options = validated(TrainOptions, {"algo": "symphony", "env": "BipedalWalker-v3", "conf_file": name})
+        arguments = algorithm_arguments("symphony", load_algorithm("symphony"), load_config(options), ACTIONS)
+        assert arguments.get("n_critics", 2) == (1 if name == "symphony-original" else 2)
+        assert "env_wrapper" not in load_config(options).plain

@@ -294,8 +294,11 @@ def check_algorithm(name: str) -> None:
 
 
 def _entry(options: TrainOptions) -> dict[str, Any]:
-    """The entry of the environment, else ``default``, in the given file or the shipped one; a flat file is its own entry."""
-    path = Path(options.conf_file) if options.conf_file else shipped_folder() / f"{options.algo}.yml"
+    """The environment's entry, else ``default``, of the given file or preset or the shipped file; a flat file is its own."""
+    path = Path(options.conf_file or shipped_folder() / f"{options.algo}.yml")
+    preset = shipped_folder() / "presets" / f"{path}.yml"
+    if preset.is_file() and not path.exists():
+        path = preset
     content = read_yaml(path)
     for name in (options.env, "default"):
         if name in content:
