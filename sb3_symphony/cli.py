@@ -81,7 +81,7 @@ def _add_train(commands: Any) -> None:
     add("--eval-freq", type=_whole_number, metavar="N", help="steps between evaluations, 0: none (default: %(default)s)")
     add("--eval-episodes", type=_whole_number, metavar="N", help="episodes of an evaluation (default: %(default)s)")
     add("-params", "--hyperparams", nargs="+", metavar="K:V", help="override hyper-parameters; values are YAML")
-    add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset to use, such as symphony-original (default: shipped)")
+    add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset to use, e.g. symphony-original (default: shipped)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
     add("-tb", "--tensorboard-log", metavar="DIR", help="write TensorBoard logs there")
     add("--save-freq", type=_whole_number, metavar="N", help="steps between saved models, -1: none (default: %(default)s)")
