@@ -12,6 +12,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_symphony.common.buffers import FadingReplayBuffer
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.noise import StickyActionNoise
+from sb3_symphony.common.regression import FusedRegression
 from sb3_symphony.common.wrappers import RewardFloor
 from sb3_symphony.experiment.config import (
     ConfigError,
@@ -241,6 +242,13 @@ def test_every_shipped_entry_fits_its_class(algo):
         arguments = algorithm_arguments(algo, load_algorithm(algo), loaded, ACTIONS)
         assert arguments.keys() <= argument_types(load_algorithm(algo)).keys()
         split_wrappers(loaded.settings.env_wrapper)
+
+
+@pytest.mark.parametrize("algo", ["symphony", "redq", "droq"])
+def test_every_shipped_entry_takes_the_fused_way(algo):
+    for env in shipped_environments(algo):
+        model = load_algorithm(algo)(env="Pendulum-v1", device="cpu", **decode(algo, env))
+        assert type(model._regression) is FusedRegression, env
 
 
 def test_shipped_hopper_entries_agree():

@@ -5,6 +5,7 @@ The only place with two implementations: plain autograd, for any network and opt
 with Adam. They compute the same numbers up to rounding, on the same parameters and optimiser state.
 """
 
+import logging
 from typing import NamedTuple
 
 import torch as th
@@ -16,6 +17,8 @@ from torch.optim.adam import adam
 from sb3_symphony.common.ensembles import EnsembleCritic
 from sb3_symphony.common.fused import FusedNetwork, uncovered
 from sb3_symphony.common.losses import CRITIC_LOSSES
+
+logger = logging.getLogger(__name__)
 
 ENGINES = ("auto", "autograd", "fused")
 
@@ -174,5 +177,7 @@ def make_regression(
     reason = not_fusable(critic)
     if engine == "fused" and reason is not None:
         raise ValueError(f"critic_engine='fused' is not possible: {reason}; expected critic_engine='auto' or 'autograd'")
+    if engine == "auto" and reason is not None:
+        logger.info("critics are fitted by autograd: %s", reason)
     chosen = CriticRegression if engine == "autograd" or reason is not None else FusedRegression
     return chosen(critic, critic_target, loss, reduction)
