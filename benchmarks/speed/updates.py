@@ -281,7 +281,7 @@ def sbx(setting: Setting, delayed: bool) -> tuple[None, Turn]:
 
     def train(n_updates: int) -> None:
         model.train(gradient_steps=n_updates, batch_size=setting.batch)
-        jax.block_until_ready(model.qf_state.params)  # updates are dispatched asynchronously
+        jax.block_until_ready(model.policy.qf_state.params)  # updates are dispatched asynchronously
 
     return None, train
 
