@@ -6,6 +6,7 @@ matrix products. Each operation below owns its workspaces: ``forward`` takes wha
 the gradient with respect to its own result, and both may overwrite their argument.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 
@@ -18,7 +19,7 @@ from sb3_symphony.common.layers import LeakySine, StackedLayerNorm, StackedLinea
 aten = th.ops.aten
 
 
-class Operation:
+class Operation(ABC):
     """
     One layer of all members: ``(n_members, batch, features)`` in and out.
 
@@ -30,11 +31,13 @@ class Operation:
         self.parameters: list[nn.Parameter] = list(module.parameters())
         self.grads = [th.zeros_like(parameter) for parameter in self.parameters]
 
+    @abstractmethod
     def forward(self, x: th.Tensor) -> th.Tensor:
-        raise NotImplementedError
+        """The layer's result."""
 
+    @abstractmethod
     def backward(self, grad: th.Tensor) -> th.Tensor:
-        raise NotImplementedError
+        """The gradient with respect to the layer's argument; those of its parameters are left in ``grads``."""
 
 
 class Linear(Operation):
