@@ -33,6 +33,10 @@ def __getattr__(name: str) -> Any:
     # Loaded on first use, so that the command line answers --help without waiting for torch
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    parts = {"Symphony": "symphony", "REDQ": "redq", "DroQ": "redq"}
-    home = "common.buffers" if name.endswith("ReplayBuffer") else "common.noise" if name.endswith("Noise") else parts[name]
+    if name.endswith("ReplayBuffer"):
+        home = "common.buffers"
+    elif name.endswith("Noise"):
+        home = "common.noise"
+    else:
+        home = "symphony" if name == "Symphony" else "redq"
     return getattr(import_module(f"{__name__}.{home}"), name)

@@ -1,6 +1,6 @@
 """N critics as one module with stacked parameters ``(n_critics, in, out)``."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -74,6 +74,24 @@ def adam_defaults(optimizer_class: type[th.optim.Optimizer]) -> dict[str, bool]:
     return {"fused": True} if optimizer_class in (th.optim.Adam, th.optim.AdamW) else {}
 
 
+def _modules(
+    input_dim: int,
+    output_dim: int,
+    hidden: list[HiddenLayer],
+    linear: Callable[[int, int], nn.Module],
+    norm: Callable[[int], nn.Module],
+) -> list[nn.Module]:
+    """The layers of a network, from input to output, made of the given kinds of linear layer and normalisation."""
+    modules: list[nn.Module] = []
+    for width, activation_fn, layer_norm, dropout_rate in hidden:
+        modules.append(linear(input_dim, width))
+        modules += [nn.Dropout(dropout_rate)] if dropout_rate > 0 else []
+        modules += [norm(width)] if layer_norm else []
+        modules.append(activation_fn())
+        input_dim = width
+    return [*modules, linear(input_dim, output_dim)]
+
+
 def mlp(input_dim: int, output_dim: int, hidden: list[HiddenLayer]) -> nn.Sequential:
     """
     One ordinary network with the given hidden layers and a linear output.
@@ -82,14 +100,7 @@ def mlp(input_dim: int, output_dim: int, hidden: list[HiddenLayer]) -> nn.Sequen
     :param output_dim: Size of its output
     :param hidden: See :func:`hidden_layers`
     """
-    modules: list[nn.Module] = []
-    for width, activation_fn, layer_norm, dropout_rate in hidden:
-        modules.append(nn.Linear(input_dim, width))
-        modules += [nn.Dropout(dropout_rate)] if dropout_rate > 0 else []
-        modules += [nn.LayerNorm(width)] if layer_norm else []
-        modules.append(activation_fn())
-        input_dim = width
-    return nn.Sequential(*modules, nn.Linear(input_dim, output_dim))
+    return nn.Sequential(*_modules(input_dim, output_dim, hidden, nn.Linear, nn.LayerNorm))
 
 
 class StackedMLP(nn.Module):
@@ -107,16 +118,8 @@ class StackedMLP(nn.Module):
         self, n_members: int, input_dim: int, output_dim: int, hidden: list[HiddenLayer], init: str = "default"
     ) -> None:
         super().__init__()
-        modules: list[nn.Module] = []
-        for width, activation_fn, layer_norm, dropout_rate in hidden:
-            modules.append(StackedLinear(n_members, input_dim, width, init))
-            modules += [nn.Dropout(dropout_rate)] if dropout_rate > 0 else []
-            modules += [StackedLayerNorm(n_members, width)] if layer_norm else []
-            modules.append(activation_fn())
-            input_dim = width
-        modules.append(StackedLinear(n_members, input_dim, output_dim, init))
-        self.layers = nn.ModuleList(modules)
-        self.hidden = hidden
+        linear = partial(StackedLinear, n_members, init=init)
+        self.layers = nn.ModuleList(_modules(input_dim, output_dim, hidden, linear, partial(StackedLayerNorm, n_members)))
 
     def forward(self, x: th.Tensor, members: list[int] | None = None) -> th.Tensor:
         """

@@ -123,7 +123,7 @@ class SymphonyPolicy(TD3Policy):
             action_space,
             lr_schedule,
             [256, 256] if net_arch is None else net_arch,
-            activation_fn,  # type: ignore[arg-type]
+            activation_fn,  # type: ignore[arg-type]  # TD3Policy only hands it on, lists are allowed here
             features_extractor_class or self.default_features_extractor,
             features_extractor_kwargs,
             normalize_images,
