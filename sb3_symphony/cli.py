@@ -16,6 +16,7 @@ from sb3_symphony.experiment.config import (
     validated,
 )
 from sb3_symphony.experiment.registry import ALGORITHMS
+from sb3_symphony.experiment.select import SelectOptions
 
 _TRAIN_EXAMPLES = """examples:
   sb3-symphony train                                  Symphony learns to walk
@@ -107,6 +108,25 @@ def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     result = train(options, command=shlex.join(["sb3-symphony", *argv]))
     print(result.summary())
     return 130 if result.interrupted else 0
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
+    """The flags of :class:`SelectOptions`, which all commands on trained agents share."""
+    add = parser.add_argument_group("which agent").add_argument
+    add("--model", metavar="PATH", help="model's zip file, or run folder (default: looked for by the next flags)")
+    add("--algo", metavar="ALGO", help="its algorithm (default: the run's, or symphony)")
+    add("--env", metavar="ID", help="its environment (default: the run's, or BipedalWalker-v3)")
+    add("-f", "--folder", metavar="DIR", help="where runs are kept (default: %(default)s)")
+    add("--exp-id", type=_whole_number, metavar="N", help="number of the run; 0: latest, -1: no run folder (default: 0)")
+    add("--load-best", action="store_true", help="model with the best evaluation instead of the last")
+    add("--load-checkpoint", type=_whole_number, metavar="N", help="model saved after N steps")
+    add("--load-last-checkpoint", action="store_true", help="model saved last")
+    add("--vecnormalize", metavar="PKL", help="statistics of VecNormalize (default: the run's)")
+    add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
+    add("--gym-packages", nargs="+", metavar="M", help="modules to import, which register environments")
+    add("--device", help="auto, cpu or cuda (default: %(default)s)")
+    add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch (default: PyTorch's)")
+    parser.set_defaults(**{**SelectOptions().model_dump(), "env_kwargs": []})
 
 
 def _add_list(commands: Any) -> None:

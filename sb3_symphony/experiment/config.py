@@ -9,6 +9,7 @@ Stable-Baselines3.
 
 import ast
 import re
+from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,18 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"[-+]?\d[\d_]*(\.[\d_]*)?[eE][-+]?\d+$"), list("-+0123456789")
 )
+
+
+def _ordered_mapping(loader: yaml.SafeLoader, node: yaml.Node) -> dict[str, Any]:
+    """RL Zoo tags the mapping of a ``config.yml`` as an ``OrderedDict``: its pairs are read as a plain mapping."""
+    try:
+        (pairs,) = loader.construct_sequence(node, deep=True)  # type: ignore[arg-type]  # else ConstructorError
+        return dict(pairs)
+    except (TypeError, ValueError):
+        raise yaml.constructor.ConstructorError(None, None, "not an ordered mapping", node.start_mark) from None
+
+
+_Loader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered_mapping)
 
 
 def parse_yaml(text: str, origin: str) -> Any:
@@ -136,13 +149,14 @@ def parse_expression(text: str) -> Any:
         raise ConfigError(f"'{text}' — expected a mapping, or dict(...) of plain values and class names") from None
 
 
-def shipped_folder() -> Path:
+def shipped_folder(name: str = "hyperparams") -> Path:
     """
-    :return: folder of the YAML files that come with the package: inside it when installed, beside it in a checkout
+    :param name: folder of files that come with the package, by default the YAML files
+    :return: its path: inside the package when installed, beside it in a checkout
     """
     package = Path(__file__).resolve().parents[1]
-    installed = package / "hyperparams"
-    return installed if installed.is_dir() else package.parent / "hyperparams"
+    installed = package / name
+    return installed if installed.is_dir() else package.parent / name
 
 
 def shipped_environments(algo: str) -> list[str]:
@@ -228,6 +242,7 @@ class RunSettings(BaseModel):
     :param normalize: ``VecNormalize`` with its defaults, or its arguments
     :param env_wrapper: dotted names of wrappers and their arguments, from the inside out
     :param env_kwargs: arguments of the environment
+    :param frame_stack: number of latest observations that the agent sees at once, by ``VecFrameStack``
     :param noise_type: exploration noise of Stable-Baselines3, by Zoo's names
     :param noise_std: its standard deviation, in scaled action units
     """
@@ -240,6 +255,7 @@ class RunSettings(BaseModel):
     normalize: bool | dict[str, Any] = False
     env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_wrapper_list)] = []
     env_kwargs: dict[str, Any] = {}
+    frame_stack: _Count | None = None
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
     noise_std: Annotated[FiniteFloat, Field(ge=0)] | None = None
 
@@ -283,13 +299,14 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
         raise ConfigError(f"{key}: {values.get(key)!r} — {message}") from None
 
 
-def check_algorithm(name: str) -> None:
+def check_algorithm(name: str, known: Iterable[str] = ALGORITHMS) -> None:
     """
     :param name: name of an algorithm
+    :param known: those that can be meant, by default those that can be trained
     :raises ConfigError: if there is none of that name
     """
-    if name not in ALGORITHMS:
-        near = suggestion(name, ALGORITHMS) or f" — expected one of {', '.join(ALGORITHMS)}"
+    if name not in known:
+        near = suggestion(name, known) or f" — expected one of {', '.join(known)}"
         raise ConfigError(f"unknown algorithm '{name}'{near}")
 
 
@@ -320,6 +337,31 @@ def _override(plain: dict[str, Any], key: str, value: Any) -> None:
     plain[last] = value
 
 
+def _read_expressions(plain: dict[str, Any]) -> None:
+    for key in ("policy_kwargs", "replay_buffer_kwargs", "env_kwargs", "normalize"):
+        if isinstance(plain.get(key), str):
+            try:
+                plain[key] = parse_expression(plain[key])
+            except ConfigError as error:
+                raise ConfigError(f"{key}: {error}") from None
+
+
+def run_settings(content: dict[str, Any]) -> RunSettings:
+    """
+    Take what is about the run from a configuration, such as the ``config.yml`` of a run folder.
+
+    :param content: plain values, the algorithm's keys among them
+    :return: the run's settings
+    :raises ConfigError: if one of them is wrong
+    """
+    plain = {key: value for key, value in content.items() if key in RunSettings.model_fields and value is not None}
+    _read_expressions(plain)
+    settings = validated(RunSettings, plain)
+    if (settings.noise_type is None) != (settings.noise_std is None):
+        raise ConfigError("noise_type and noise_std: expected both or neither")
+    return settings
+
+
 def load_config(options: TrainOptions) -> RunConfig:
     """
     Merge the shipped entry (or the given file instead of it) with the command line, later ones winning.
@@ -330,29 +372,16 @@ def load_config(options: TrainOptions) -> RunConfig:
     """
     check_algorithm(options.algo)
     plain = _entry(options)
-    mappings = ("policy_kwargs", "replay_buffer_kwargs", "env_kwargs", "normalize")
-
-    def read_expressions() -> None:
-        for key in mappings:
-            if isinstance(plain.get(key), str):
-                try:
-                    plain[key] = parse_expression(plain[key])
-                except ConfigError as error:
-                    raise ConfigError(f"{key}: {error}") from None
-
-    read_expressions()  # before, so that items of them can be overridden
+    _read_expressions(plain)  # before, so that items of them can be overridden
     for key, value in options.hyperparams.items():
         _override(plain, key, value)
-    read_expressions()
+    _read_expressions(plain)
     if options.n_timesteps > 0:
         plain["n_timesteps"] = options.n_timesteps
     if options.env_kwargs:
         plain["env_kwargs"] = {**(plain.get("env_kwargs") or {}), **options.env_kwargs}
     plain = {key: value for key, value in plain.items() if not (value is None and key in RunSettings.model_fields)}
-
-    settings = validated(RunSettings, {key: value for key, value in plain.items() if key in RunSettings.model_fields})
-    if (settings.noise_type is None) != (settings.noise_std is None):
-        raise ConfigError("noise_type and noise_std: expected both or neither")
+    settings = run_settings(plain)
     plain["n_timesteps"] = settings.n_timesteps
     arguments = {key: value for key, value in plain.items() if key not in RunSettings.model_fields}
     return RunConfig(settings, arguments, plain)

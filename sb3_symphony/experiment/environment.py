@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env, unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
@@ -27,6 +27,7 @@ EVALUATION_SEED = 10_000
 _WRAPPER_PACKAGES = ("sb3_symphony.", "gymnasium.wrappers.", "stable_baselines3.", "sb3_contrib.")
 _WRITE_FILES = {"Monitor", "RecordVideo"}  # a configuration must not choose what is written where
 _TRAINING_ONLY = (LearningReward, EpisodeStepLimit)
+_ON_POLICY = ("ppo", "trpo")
 _ON_POLICY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 Wrappers = list[Callable[[gym.Env], gym.Env]]
@@ -109,6 +110,20 @@ def _wrapped(env: gym.Env, wrappers: Wrappers) -> gym.Env:
     return env
 
 
+def import_packages(names: list[str]) -> None:
+    """
+    Import modules that register environments.
+
+    :param names: importable names
+    :raises ConfigError: for the first one that cannot be imported
+    """
+    for name in names:
+        try:
+            import_module(name)
+        except Exception as error:  # whatever the module does
+            raise ConfigError(f"--gym-packages: '{name}' cannot be imported — {type(error).__name__}: {error}") from error
+
+
 def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym.Env:
     """
     Make one environment; a Box2D one with a fresh world in every episode.
@@ -149,11 +164,14 @@ def check_spaces(env: VecEnv, env_id: str, algo: str, policy: str) -> None:
     :raises ConfigError: if algorithm or policy do not fit its spaces
     """
     space = env.action_space
-    allowed = _ON_POLICY_SPACES if algo in ("ppo", "trpo") else (spaces.Box,)
+    allowed = _ON_POLICY_SPACES if algo in _ON_POLICY else (spaces.Box,)
     if not isinstance(space, allowed):
         raise ConfigError(f"{env_id}: its action space is {space} — {algo} needs a continuous one (Box)")
     if isinstance(space, spaces.Box) and not np.all(np.isfinite([space.low, space.high])):
         raise ConfigError(f"{env_id}: its action space {space} is unbounded — {algo} needs finite limits")
+    if algo not in _ON_POLICY and isinstance(env, VecFrameStack) and unwrap_vec_normalize(env) is not None:
+        # The replay keeps what VecNormalize was given, one observation at a time
+        raise ConfigError(f"frame_stack: cannot be combined with normalize for {algo} — only for {', '.join(_ON_POLICY)}")
     if policy == "MultiInputPolicy" and not isinstance(env.observation_space, spaces.Dict):
         raise ConfigError(f"policy: 'MultiInputPolicy' — needs Dict observations, {env_id} has {env.observation_space}")
 
@@ -173,6 +191,21 @@ def _normalized(env: VecEnv, settings: RunSettings, gamma: float | None, trainin
         raise ConfigError(f"normalize: {error}") from None
 
 
+def stacked(env: VecEnv, settings: RunSettings) -> VecEnv:
+    """
+    :param env: vectorised environment, already normalised (as in RL Zoo, so that statistics are those of one observation)
+    :param settings: settings of the run
+    :return: the environment, its latest observations stacked if the settings want that
+    :raises ConfigError: if they cannot be
+    """
+    if settings.frame_stack is None:
+        return env
+    try:
+        return VecFrameStack(env, settings.frame_stack)
+    except (ValueError, TypeError, AssertionError, NotImplementedError) as error:
+        raise ConfigError(f"frame_stack: observations of {env.observation_space} cannot be stacked — {error}") from None
+
+
 def make_training_env(env_id: str, settings: RunSettings, gamma: float | None, seed: int) -> VecEnv:
     """
     :param env_id: registered id
@@ -188,7 +221,7 @@ def make_training_env(env_id: str, settings: RunSettings, gamma: float | None, s
         seed=seed,
         wrapper_class=partial(_wrapped, wrappers=training),
     )
-    return _normalized(env, settings, gamma, training=True)
+    return stacked(_normalized(env, settings, gamma, training=True), settings)
 
 
 def make_evaluation_env(env_id: str, settings: RunSettings) -> VecEnv:
@@ -202,7 +235,7 @@ def make_evaluation_env(env_id: str, settings: RunSettings) -> VecEnv:
     def evaluation_env() -> gym.Env:
         return Monitor(EpisodeSeeds(make_env(env_id, settings.env_kwargs, task)))
 
-    return _normalized(DummyVecEnv([evaluation_env]), settings, None, training=False)
+    return stacked(_normalized(DummyVecEnv([evaluation_env]), settings, None, training=False), settings)
 
 
 def attach_monitor_files(env: VecEnv, folder: Path) -> None:

@@ -20,13 +20,23 @@ ALGORITHMS: dict[str, tuple[str, str, str]] = {
     "crossq": ("sb3_contrib", "CrossQ", "batch-normalised critics without target networks"),
 }
 
+#: also those that can be evaluated but not trained here
+LOADABLE: dict[str, tuple[str, str, str]] = {
+    **ALGORITHMS,
+    "a2c": ("stable_baselines3", "A2C", "advantage actor-critic (on-policy)"),
+    "dqn": ("stable_baselines3", "DQN", "deep Q network"),
+    "ars": ("sb3_contrib", "ARS", "augmented random search"),
+    "qrdqn": ("sb3_contrib", "QRDQN", "quantile regression DQN"),
+    "ppo_lstm": ("sb3_contrib", "RecurrentPPO", "PPO with a recurrent policy"),
+}
+
 
 def load_algorithm(name: str) -> type["BaseAlgorithm"]:
     """
     Import an algorithm.
 
-    :param name: a key of :data:`ALGORITHMS`
+    :param name: a key of :data:`LOADABLE`
     :return: its class
     """
-    module, class_name, _ = ALGORITHMS[name]
+    module, class_name, _ = LOADABLE[name]
     return getattr(import_module(module), class_name)

@@ -33,13 +33,12 @@ class RunFolder:
         :return: the new folder
         :raises ConfigError: if it cannot be written
         """
-        env_name = env_id.rpartition(":")[2].replace("/", "-")
+        env_name = cls.file_name(env_id)
         parent = Path(log_folder) / algo
         try:
             parent.mkdir(parents=True, exist_ok=True)
             while True:
-                numbers = (re.fullmatch(rf"{re.escape(env_name)}_(\d+)", entry.name) for entry in parent.iterdir())
-                run = cls(parent / f"{env_name}_{1 + max((int(n[1]) for n in numbers if n), default=0)}", env_name)
+                run = cls(parent / f"{env_name}_{1 + max(cls.numbers(parent, env_name), default=0)}", env_name)
                 try:
                     run.path.mkdir()
                 except FileExistsError:
@@ -48,6 +47,24 @@ class RunFolder:
                 return run
         except OSError as error:
             raise ConfigError(f"--log-folder: '{log_folder}' cannot be written — {error.strerror}") from None
+
+    @staticmethod
+    def file_name(env_id: str) -> str:
+        """
+        :param env_id: id of an environment
+        :return: the id as it appears in file names
+        """
+        return env_id.rpartition(":")[2].replace("/", "-")
+
+    @staticmethod
+    def numbers(parent: Path, env_name: str) -> set[int]:
+        """
+        :param parent: folder of an algorithm's runs
+        :param env_name: the environment's id as it appears in file names
+        :return: numbers of its runs
+        """
+        entries = parent.iterdir() if parent.is_dir() else ()
+        return {int(found[1]) for entry in entries if (found := re.fullmatch(rf"{re.escape(env_name)}_(\d+)", entry.name))}
 
     @property
     def details(self) -> Path:
@@ -58,6 +75,11 @@ class RunFolder:
     def model(self) -> Path:
         """The model at the end of the run."""
         return self.path / f"{self.env_name}.zip"
+
+    @property
+    def best_model(self) -> Path:
+        """The model with the best mean evaluation."""
+        return self.path / "best_model.zip"
 
     @property
     def normalization(self) -> Path:

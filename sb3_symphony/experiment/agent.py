@@ -1,0 +1,271 @@
+"""A trained agent in its environment: loaded, checked against each other, and played episode by episode."""
+
+import json
+import sys
+import warnings
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
+
+from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.environment import Wrappers, import_packages, make_env, split_wrappers, stacked
+from sb3_symphony.experiment.registry import LOADABLE, load_algorithm
+from sb3_symphony.experiment.select import Selection, SelectOptions, pretrained_folder, select_model
+
+#: Parts of a model that acting does not need, and what stands in for them. They hold pickles that often do not outlive
+#: a version of Python, NumPy or Stable-Baselines3, and a replay buffer of full size
+_UNUSED: dict[str, Any] = {
+    "learning_rate": 0.0,
+    "lr_schedule": lambda _: 0.0,
+    "clip_range": lambda _: 0.0,
+    "clip_range_vf": None,
+    "exploration_schedule": lambda _: 0.0,
+    "action_noise": None,
+    "replay_buffer_class": None,
+    "replay_buffer_kwargs": {},
+    "ep_info_buffer": None,
+    "ep_success_buffer": None,
+    "_last_obs": None,
+    "_last_original_obs": None,
+    "_last_episode_starts": None,
+    "tensorboard_log": None,
+    "verbose": 0,
+}
+
+
+class Step(NamedTuple):
+    """
+    One step of an episode.
+
+    :param observation: what the agent saw, normalised and stacked if it is, shape ``(*observation_shape,)``
+    :param action: what it did, in the environment's units, shape ``(*action_shape,)``
+    :param reward: the environment's own reward for it
+    :param done: whether the episode ended with it; the environment is then already reset
+    :param info: the environment's info; after the last step ``info["episode"]`` holds return ``r`` and length ``l``
+    """
+
+    observation: Any
+    action: np.ndarray
+    reward: float
+    done: bool
+    info: dict[str, Any]
+
+
+@dataclass
+class Agent:
+    """
+    A model and the environment that it acts in. Used in a ``with`` statement, it closes the environment at the end.
+
+    :param selection: where both come from
+    :param model: any algorithm's model, for ``predict`` only
+    :param env: vectorised environment with ``Monitor``, normalised with frozen statistics and stacked as in training
+    """
+
+    selection: Selection
+    model: BaseAlgorithm
+    env: VecEnv
+
+    def __enter__(self) -> "Agent":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.env.close()
+
+    def episode(self, seed: int, deterministic: bool = True) -> Iterator[Step]:
+        """
+        Play one episode, in an environment with one copy. Environment, policy and Python's, NumPy's and torch's global
+        generators are seeded, so the episode depends on nothing else.
+
+        :param seed: seed of the episode
+        :param deterministic: whether the policy is asked for its mode instead of a sample
+        :return: its steps, one by one
+        """
+        assert self.env.num_envs == 1
+        set_random_seed(seed)
+        self.env.seed(seed)
+        observation: Any = self.env.reset()
+        state, start, done = None, np.ones(1, dtype=bool), False
+        while not done:
+            action, state = self.model.predict(observation, state, start, deterministic)
+            seen = observation
+            observation, rewards, start, infos = self.env.step(action)
+            done = bool(start[0])
+            seen = {key: value[0] for key, value in seen.items()} if isinstance(seen, dict) else seen[0]
+            yield Step(seen, action[0], float(rewards[0]), done, infos[0])
+
+
+def open_agent(
+    options: SelectOptions,
+    n_envs: int = 1,
+    render_mode: str | None = None,
+    wrappers: Wrappers | None = None,
+    norm_reward: bool = False,
+    monitor_folder: Path | None = None,
+) -> Agent:
+    """
+    Find and load an agent, and make the environment that it acts in.
+
+    :param options: flags that say which agent
+    :param n_envs: copies of the environment, in this process
+    :param render_mode: Gymnasium's: ``"human"`` for a window, ``"rgb_array"`` for frames
+    :param wrappers: put around the environment, inside ``Monitor``
+    :param norm_reward: whether rewards are normalised as in training; reported returns are the environment's own
+    :param monitor_folder: folder for the monitors' CSV files
+    :return: the agent
+    :raises ConfigError: if something is missing or damaged, or model and environment do not fit
+    """
+    import_packages(options.gym_packages)
+    check_device(options.device)
+    selection = select_model(options)
+    if options.num_threads > 0:
+        th.set_num_threads(options.num_threads)
+    env = _make_env(selection, n_envs, render_mode, wrappers or [], norm_reward, monitor_folder)
+    try:
+        model = load_model(selection, options.device)
+        env = BaseAlgorithm._wrap_env(env, verbose=0)  # images with their channels first, as in training
+        _check_match(model, env, selection)
+    except BaseException:
+        env.close()
+        raise
+    return Agent(selection, model, env)
+
+
+def check_device(name: str) -> None:
+    """
+    :param name: name of a device
+    :raises ConfigError: if torch has none of that name here
+    """
+    try:
+        device = "cpu" if name == "auto" else th.device(name).type
+    except RuntimeError:
+        device = ""
+    if not device or (device == "cuda" and not th.cuda.is_available()):
+        raise ConfigError(f"--device: '{name}' is not there — expected auto, cpu" + ", cuda" * th.cuda.is_available())
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Environment
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _make_env(
+    selection: Selection, n_envs: int, render_mode: str | None, wrappers: Wrappers, norm_reward: bool, folder: Path | None
+) -> VecEnv:
+    task, _ = split_wrappers(selection.settings.env_wrapper)
+    env_kwargs = dict(selection.settings.env_kwargs)
+    if render_mode is not None:
+        env_kwargs["render_mode"] = render_mode
+
+    def one(index: int) -> gym.Env:
+        env = make_env(selection.env_id, env_kwargs, [*task, *wrappers])
+        return Monitor(env, str(folder / str(index)) if folder else None)
+
+    env: VecEnv = DummyVecEnv([lambda index=index: one(index) for index in range(n_envs)])  # type: ignore[misc]
+    if selection.normalization is not None:
+        env = _load_normalization(selection.normalization, env)
+        env.training, env.norm_reward = False, norm_reward and env.norm_reward
+    return stacked(env, selection.settings)
+
+
+def _load_normalization(path: Path, env: VecEnv) -> VecNormalize:
+    try:
+        return VecNormalize.load(str(path), env)
+    except Exception as error:  # a pickle can fail in any way
+        env.close()
+        if isinstance(error, AssertionError):  # shapes
+            raise ConfigError(f"{path}: statistics do not fit the environment — {error}") from error
+        raise ConfigError(f"{path}: not statistics of VecNormalize, or damaged — {_told(error)}") from error
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Model
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _tell_of_pickles() -> None:
+    """Once in a process."""
+    print(
+        "note: model files hold pickled objects, which can run any code when loaded: load them only from people you trust",
+        file=sys.stderr,
+    )
+
+
+def load_model(selection: Selection, device: str = "auto") -> BaseAlgorithm:
+    """
+    Load a model to act with; what only training needs is left out, so it cannot go on learning.
+
+    :param selection: what to load
+    :param device: where its networks run
+    :return: the model, without environment
+    :raises ConfigError: if the file is damaged or of another algorithm
+    """
+    algorithm = load_algorithm(selection.algo)
+    _check_archive(selection, algorithm)
+    if selection.run is None and not selection.model.resolve().is_relative_to(pretrained_folder().resolve()):
+        _tell_of_pickles()
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*n_steps.*")  # SB3's, about the replay that is left out
+            return algorithm.load(selection.model, device=device, custom_objects=_UNUSED, buffer_size=1)
+    except Exception as error:  # a pickle can fail in any way
+        raise ConfigError(f"{selection.model}: cannot be loaded as a model of {selection.algo} — {_told(error)}") from error
+
+
+def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None:
+    """Whether a file is a model of the algorithm at all, seen without unpickling anything."""
+    path = selection.model
+    try:
+        with zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()
+            if broken:
+                raise zipfile.BadZipFile(f"{broken} is damaged")
+            policy = json.loads(archive.read("data"))["policy_class"]["__module__"]
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read — {error.strerror or error}") from None
+    except Exception as error:
+        raise ConfigError(f"{path}: not a model saved by Stable-Baselines3, or damaged — {_told(error)}") from None
+
+    def policies(of: type[BaseAlgorithm]) -> set[str]:
+        return {class_.__module__ for class_ in of.policy_aliases.values()}
+
+    if policy not in policies(algorithm):
+        owners = [name for name in LOADABLE if policy in policies(load_algorithm(name))]
+        if owners:  # else a policy of somebody's own
+            raise ConfigError(f"{path}: not a model of {selection.algo} — its policy is that of {' or '.join(owners)}")
+
+
+def _fits(model: spaces.Space, env: spaces.Space, exact: bool) -> bool:
+    if isinstance(model, spaces.Dict) and isinstance(env, spaces.Dict):
+        return model.keys() == env.keys() and all(_fits(model[key], env[key], exact) for key in model)
+    if isinstance(model, spaces.Box) and isinstance(env, spaces.Box) and not exact:
+        return model.shape == env.shape and (model.dtype == np.uint8) == (env.dtype == np.uint8)
+    return model == env
+
+
+def _check_match(model: BaseAlgorithm, env: VecEnv, selection: Selection) -> None:
+    """Limits of observations are not compared: they differ between versions of an environment, and nothing uses them."""
+    for what, own, given, exact in (
+        ("observation", model.observation_space, env.observation_space, False),
+        ("action", model.action_space, env.action_space, True),
+    ):
+        if not _fits(own, given, exact):
+            both = f"{what} space of the model {own}, of the environment {given}"
+            raise ConfigError(f"{selection.model} does not fit {selection.env_id}: {both}")

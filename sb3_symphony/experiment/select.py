@@ -1,0 +1,240 @@
+"""
+Which trained agent: the flags that `evaluate`, `enjoy`, `video`, `gait` and `export` share, and the files they mean.
+
+Only paths and YAML are read here, nothing heavy is imported; :mod:`sb3_symphony.experiment.agent` loads what was found.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from sb3_symphony.common.checks import suggestion
+from sb3_symphony.experiment.config import ConfigError, RunSettings, check_algorithm, read_yaml, run_settings, shipped_folder
+from sb3_symphony.experiment.registry import LOADABLE
+from sb3_symphony.experiment.run_folder import RunFolder
+
+_DEFAULT_ALGO, _DEFAULT_ENV = "symphony", "BipedalWalker-v3"
+
+
+class SelectOptions(BaseModel):
+    """
+    Flags that say which agent, in which environment.
+
+    :param model: a model's zip file, or a run folder; else it is looked for under ``folder``
+    :param algo: name of the algorithm; known if the model lies in a run folder
+    :param env: id of the environment; known if the model lies in a run folder
+    :param folder: where runs are kept
+    :param exp_id: number of the run; 0: the latest; -1: ``<folder>/<algo>/<env>.zip``, outside a run folder
+    :param load_best: the model with the best evaluation instead of the last one
+    :param load_checkpoint: the model after that number of steps
+    :param load_last_checkpoint: the latest saved model of a run that did not end
+    :param vecnormalize: statistics of ``VecNormalize`` to use instead of the run's
+    :param env_kwargs: arguments of the environment, over those of the run
+    :param gym_packages: modules to import, which register environments
+    :param device: where the networks run
+    :param num_threads: threads of PyTorch, -1: its own choice
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    model: str | None = None
+    algo: str | None = None
+    env: str | None = None
+    folder: str = "logs"
+    exp_id: int = Field(default=0, ge=-1)
+    load_best: bool = False
+    load_checkpoint: int | None = Field(default=None, ge=0)
+    load_last_checkpoint: bool = False
+    vecnormalize: str | None = None
+    env_kwargs: dict[str, Any] = {}
+    gym_packages: list[str] = []
+    device: str = "auto"
+    num_threads: int = -1
+
+
+@dataclass(frozen=True)
+class Selection:
+    """
+    An agent that was found.
+
+    :param algo: name of its algorithm
+    :param model: its zip file
+    :param env_id: environment that it was trained on, or is to be used on
+    :param settings: settings of that environment: ``env_kwargs``, ``env_wrapper``, ``normalize``, ``frame_stack``
+    :param normalization: its statistics of ``VecNormalize``, None without normalisation
+    :param run: the run folder that holds it, None for a file from elsewhere
+    """
+
+    algo: str
+    model: Path
+    env_id: str
+    settings: RunSettings
+    normalization: Path | None
+    run: Path | None
+
+
+def pretrained_folder() -> Path:
+    """
+    :return: folder of the agents that come with the package, laid out like ``logs``
+    """
+    return shipped_folder("pretrained")
+
+
+def select_model(options: SelectOptions) -> Selection:
+    """
+    Find a trained agent, and the environment that it belongs to.
+
+    Without ``model``, it is looked for as RL Zoo does, in ``<folder>/<algo>/<env>_<exp-id>/``, and if the default folder
+    has no such run, among the agents that come with the package. What flags say about the environment goes before what
+    the run says.
+
+    :param options: flags
+    :return: the agent's files and environment
+    :raises ConfigError: if there is no such agent, or its environment is not known
+    """
+    wanted = {
+        "--load-best": options.load_best,
+        "--load-checkpoint": options.load_checkpoint is not None,
+        "--load-last-checkpoint": options.load_last_checkpoint,
+    }
+    given = [flag for flag, value in wanted.items() if value]
+    if len(given) > 1:
+        raise ConfigError(f"{' and '.join(given)}: expected only one of them")
+    if options.algo is not None:
+        check_algorithm(options.algo, LOADABLE)
+    if options.model is not None and options.exp_id != 0:
+        raise ConfigError(f"--exp-id: {options.exp_id} — expected --model or --exp-id, not both")
+
+    run: RunFolder | None = None
+    if options.model is not None:
+        path = Path(options.model)
+        if path.is_dir():
+            run = _run_at(path)
+            if run is None:
+                raise ConfigError(f"--model: '{path}' — expected a model's zip file, or a run folder with <env>/config.yml")
+            path = _model_of(run, options)
+        elif given:
+            raise ConfigError(f"{given[0]}: chooses among the models of a run — --model names one already")
+        else:
+            if not path.exists() and path.suffix != ".zip":
+                path = path.with_name(path.name + ".zip")
+            run = next((found for parent in list(path.absolute().parents)[:3] if (found := _run_at(parent))), None)
+    elif options.exp_id == -1:
+        algo, env_id = options.algo or _DEFAULT_ALGO, options.env or _DEFAULT_ENV
+        options = options.model_copy(update={"algo": algo, "env": env_id})
+        path = Path(options.folder) / algo / f"{RunFolder.file_name(env_id)}.zip"
+    else:
+        run = _find_run(options)
+        path = _model_of(run, options)
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file — expected a model saved by Stable-Baselines3")
+    return _selection(options, path, run)
+
+
+def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Selection:
+    trained = read_yaml(run.details / "args.yml") if run and (run.details / "args.yml").is_file() else {}
+    algo, env_id = options.algo or trained.get("algo"), options.env or trained.get("env")
+    if run is not None and options.model is None:  # named by the flags' defaults
+        algo, env_id = algo or run.path.parent.name, env_id or run.env_name
+    if algo is None:
+        raise ConfigError(f"--algo: missing — expected the algorithm that trained {model}")
+    check_algorithm(str(algo), LOADABLE)
+    if run is not None and algo != trained.get("algo", algo):
+        raise ConfigError(f"--algo: {algo} — {model} was trained with {trained['algo']}")
+    if env_id is None:
+        raise ConfigError(f"--env: missing — expected the environment that {model} is to act in")
+
+    config = read_yaml(run.details / "config.yml") if run else {}
+    # RL Zoo keeps the arguments of the environment with the command line's
+    env_kwargs = {**(config.get("env_kwargs") or {}), **(trained.get("env_kwargs") or {})}
+    if env_id != trained.get("env", env_id):
+        env_kwargs = {}  # of another environment
+    settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": {**env_kwargs, **options.env_kwargs}})
+    normalization = _normalization(options, model, run, settings)
+    return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None)
+
+
+def _normalization(options: SelectOptions, model: Path, run: RunFolder | None, settings: RunSettings) -> Path | None:
+    """Statistics that belong to the model; RL Zoo has only one file for all models of a run."""
+    if options.vecnormalize is not None:
+        path = Path(options.vecnormalize)
+        if not path.is_file():
+            raise ConfigError(f"--vecnormalize: '{path}' — no such file")
+        return path
+    if run is None or settings.normalize is False:
+        return None
+    checkpoint = re.fullmatch(r"rl_model_(\d+)_steps", model.stem)
+    if checkpoint:
+        own = model.with_name(f"rl_model_vecnormalize_{checkpoint[1]}_steps.pkl")
+    else:
+        own = run.best_normalization if model.stem == "best_model" else run.normalization
+    for path in (own, run.normalization):
+        if path.is_file():
+            return path
+    raise ConfigError(f"{model}: was trained with VecNormalize, but its statistics {own} are missing — see --vecnormalize")
+
+
+def _run_at(path: Path) -> RunFolder | None:
+    """The run folder at ``path``, recognised by ``<env>/config.yml``."""
+    for config in sorted(path.glob("*/config.yml")):
+        return RunFolder(path, config.parent.name)
+    return None
+
+
+def _find_run(options: SelectOptions) -> RunFolder:
+    """The run that algorithm, environment, folder and number name."""
+    algo, env_id = options.algo or _DEFAULT_ALGO, options.env or _DEFAULT_ENV
+    env_name = RunFolder.file_name(env_id)
+    folder = Path(options.folder)
+    numbers = RunFolder.numbers(folder / algo, env_name)
+    if not numbers and options.folder == SelectOptions.model_fields["folder"].default:
+        shipped = pretrained_folder()
+        numbers = RunFolder.numbers(shipped / algo, env_name)
+        folder = shipped if numbers else folder
+    if not numbers:
+        trained = sorted({path.name.rpartition("_")[0] for path in (folder / algo).glob("*_*") if path.is_dir()})
+        near = suggestion(env_name, trained) or (f" — there are runs of {', '.join(trained)}" if trained else "")
+        near = near or " — expected a run folder there, or --model; `sb3-symphony train` makes one"
+        raise ConfigError(f"{folder / algo}: no run of {algo} on {env_id}{near}")
+    number = options.exp_id or max(numbers)
+    if number not in numbers:
+        raise ConfigError(f"--exp-id: {number} — {folder / algo} has {env_name} number {', '.join(map(str, sorted(numbers)))}")
+    run = _run_at(folder / algo / f"{env_name}_{number}")
+    if run is None:
+        raise ConfigError(f"{folder / algo / env_name}_{number}: not a run folder — {env_name}/config.yml is missing")
+    return run
+
+
+def checkpoints(run: RunFolder) -> dict[int, Path]:
+    """
+    :param run: run folder
+    :return: number of steps → model saved then, in ascending order
+    """
+    found = {}
+    for path in run.path.glob("rl_model_*_steps.zip"):
+        steps = re.fullmatch(r"rl_model_(\d+)_steps", path.stem)
+        if steps:
+            found[int(steps[1])] = path
+    return dict(sorted(found.items()))
+
+
+def _model_of(run: RunFolder, options: SelectOptions) -> Path:
+    if options.load_best:
+        if not run.best_model.is_file():
+            raise ConfigError(f"--load-best: {run.best_model} is missing — the run had no evaluation")
+        return run.best_model
+    if options.load_last_checkpoint or options.load_checkpoint is not None:
+        saved = checkpoints(run)
+        flag = "--load-last-checkpoint" if options.load_last_checkpoint else "--load-checkpoint"
+        if not saved:
+            raise ConfigError(f"{flag}: {run.path} has no checkpoint — `train --save-freq` makes them")
+        steps = max(saved) if options.load_checkpoint is None else options.load_checkpoint
+        if steps not in saved:
+            raise ConfigError(f"{flag}: {steps} — {run.path} has checkpoints at {', '.join(map(str, saved))} steps")
+        return saved[steps]
+    if not run.model.is_file():
+        raise ConfigError(f"{run.model}: missing, the run has not ended — see --load-best and --load-last-checkpoint")
+    return run.model
