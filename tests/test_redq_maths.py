@@ -205,7 +205,8 @@ def test_target_of_the_reference(monkeypatch, target_mode, subset, expected):
     else:
         model.subset_size = "all"
     q_values = columns_of(Q_ROWS)
-    model.critic_target = lambda obs, actions, members: q_values if members is None else q_values[members]
+    of = lambda obs, actions, members: q_values if members is None else q_values[members]  # noqa: E731
+    monkeypatch.setattr(model._regression, "target_q_values", of)
     monkeypatch.setattr(th, "rand_like", lambda x: columns_of(RAW_WEIGHTS))
     recorded = []
 
@@ -288,8 +289,8 @@ def test_the_entropy_is_in_the_bootstrap_value(monkeypatch):
 
 def test_one_subset_per_update(monkeypatch):
     model, _ = model_with_data(n_critics=5, subset_size=2)
-    calls, forward = [], model.critic_target.forward
-    monkeypatch.setattr(model.critic_target, "forward", lambda o, a, members: calls.append(members) or forward(o, a, members))
+    calls, values = [], model._regression.target_q_values
+    monkeypatch.setattr(model._regression, "target_q_values", lambda *args: calls.append(args[2]) or values(*args))
     np.random.seed(0)
     model.train(12, 8)
     assert len(calls) == 12 and len({tuple(sorted(members)) for members in calls}) > 3
@@ -323,7 +324,7 @@ def test_actor_and_entropy_losses_of_the_reference(monkeypatch):
     log_probs = th.tensor([-1.5, 0.25], dtype=th.float64)
     attached = sum(parameter.sum() for parameter in model.actor.parameters()) * 0  # so that there is something to derive
     monkeypatch.setattr(model.actor, "action_log_prob", lambda obs: (th.zeros(2, 1), log_probs + attached))
-    model.critic = lambda obs, actions: columns_of(Q_ROWS[:2])
+    monkeypatch.setattr(model._regression, "q_values", lambda obs, actions: columns_of(Q_ROWS[:2]))
     logs = {key: [] for key in ("actor_loss", "ent_coef", "ent_coef_loss")}
     model._update_actor(Samples([0, 0], [0, 0]), th.tensor([0.2], dtype=th.float64), logs)
     assert logs["actor_loss"][0].item() == pytest.approx(-5.025)
@@ -452,10 +453,11 @@ def test_dropout_in_the_targets(monkeypatch, cls, active):
     assert th.equal(model.critic(*x), model.critic(*x)) and th.equal(model.critic_target(*x), model.critic_target(*x))
 
 
-def test_dropout_is_active_in_the_actor_loss(monkeypatch):
-    model, _ = model_with_data(DroQ, policy_delay=1, policy_kwargs=dict(dropout_rate=0.5))
-    modes, forward = [], model.critic.forward
-    monkeypatch.setattr(model.critic, "forward", lambda *args: modes.append(model.critic.training) or forward(*args))
-    model.predict(np.zeros(3, np.float32))
-    model.train(2, 8)
-    assert modes == [True, True]  # the critics' own passes are hand-written
+@pytest.mark.parametrize("engine", ["autograd", "fused"])
+def test_dropout_is_active_in_the_actor_loss(engine):
+    model, _ = model_with_data(DroQ, policy_kwargs=dict(dropout_rate=0.5, critic_engine=engine))
+    x = th.ones(8, 3), th.ones(8, 1)
+    model.policy.set_training_mode(True)
+    assert not th.equal(model._regression.q_values(*x), model._regression.q_values(*x))
+    model.policy.set_training_mode(False)
+    assert th.equal(model._regression.q_values(*x), model._regression.q_values(*x))

@@ -138,6 +138,32 @@ def test_batch_size_that_changes(kwargs):
     assert_equal_runs(*pair(**kwargs), sizes=(24, 40, 1, 24))
 
 
+@pytest.mark.parametrize("activation_fn", [nn.ReLU, nn.Tanh, nn.ELU, LeakySine])
+@pytest.mark.parametrize("net_arch", [[], [16, 8]], ids=str)
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("dropout_rate", [0.0, 0.3])
+def test_values_for_the_actor_and_the_target(activation_fn, net_arch, layer_norm, dropout_rate):
+    kwargs = dict(activation_fn=activation_fn, net_arch=net_arch, layer_norm=layer_norm, dropout_rate=dropout_rate)
+    results = []
+    for fitter in pair(n_critics=4, **kwargs):
+        th.manual_seed(2)
+        run(fitter, 3)
+        observations, actions, weights = batch_of(24, seed=9)
+        results.append([])
+        for members in (None, [2, 0], [1]):
+            q_values = fitter.target_q_values(observations, actions, members)
+            assert q_values.shape == (4 if members is None else len(members), 24, 1) and not q_values.requires_grad
+            results[-1].append(q_values.clone())
+        actions.requires_grad_()
+        q_values = fitter.q_values(observations, actions)
+        (gradient,) = th.autograd.grad((q_values * weights).sin().sum(), actions)  # one that differs between critics
+        results[-1] += [q_values.detach(), gradient]
+        results[-1].append(fitter.fit(observations, actions.detach(), weights, TAU).q_values)  # nothing has been disturbed
+    for one, other in zip(*results, strict=True):
+        th.testing.assert_close(other, one, rtol=1e-9, atol=1e-9)
+        assert one.abs().max() > 0
+
+
 def test_learning_rate_that_changes():
     def change(i, fitter):
         for group in fitter.critic.optimizer.param_groups:
@@ -294,7 +320,7 @@ def test_critic_loss_of_the_reference(reduction, loss, gradient):
     """``ensemble_mean`` without the factor 1/2 of the reference."""
     fitter = regression("autograd", n_critics=2, reduction=reduction)
     q_values = th.tensor([[1.0, 2.0], [3.0, 5.0]], dtype=th.float64).t()[..., None].clone().requires_grad_()
-    value = fitter._loss(q_values, th.tensor([[2.0], [4.0]], dtype=th.float64), None)
+    value = fitter.loss(fitter._error(q_values, th.tensor([[2.0], [4.0]], dtype=th.float64)), None).sum()
     value.backward()
     assert value.item() == pytest.approx(loss)
     assert q_values.grad[..., 0].t().tolist() == gradient

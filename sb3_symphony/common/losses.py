@@ -51,6 +51,31 @@ def rehe_elementwise(error: th.Tensor, weights: th.Tensor | None = None) -> th.T
     return _mean(error * (error / 2).tanh(), weights)
 
 
+def _share(slope: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+    """The derivative of :func:`_mean` of something whose derivative is ``slope (n_critics, batch, 1)``."""
+    return (slope if weights is None else slope * weights) / slope.shape[1]
+
+
+def _mse_slope(error: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+    return _share(2 * error, weights)
+
+
+def _huber_slope(error: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+    return _share(error.clamp(-1, 1), weights)
+
+
+def _rehe_slope(error: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+    m = _mean(error.abs(), weights)[:, None, None]
+    tanh = m.tanh()
+    return _share(error.sign() * (tanh + m * (1 - tanh.square())), weights)
+
+
+def _rehe_elementwise_slope(error: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+    half = error / 2
+    tanh = half.tanh()
+    return _share(tanh + half * (1 - tanh.square()), weights)
+
+
 def rehae(q_values: th.Tensor, baseline: th.Tensor) -> th.Tensor:
     """
     Rectified Huber *asymmetric* error (Read 2024), to be maximised: ``|d| * tanh(d)``, ``d = mean(q_values) - baseline``.
@@ -77,4 +102,11 @@ def mean_value(q_values: th.Tensor, baseline: th.Tensor) -> th.Tensor:
 
 
 CRITIC_LOSSES: dict[str, CriticLoss] = {"mse": mse, "huber": huber, "rehe": rehe, "rehe_elementwise": rehe_elementwise}
+# Their derivatives with respect to each error, (n_critics, batch, 1), which autograd would find at several times the cost
+CRITIC_LOSS_SLOPES: dict[str, CriticLoss] = {
+    "mse": _mse_slope,
+    "huber": _huber_slope,
+    "rehe": _rehe_slope,
+    "rehe_elementwise": _rehe_elementwise_slope,
+}
 ACTOR_LOSSES: dict[str, ActorLoss] = {"rehae": rehae, "rehae_elementwise": rehae_elementwise, "mean": mean_value}

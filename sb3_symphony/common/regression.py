@@ -6,17 +6,19 @@ with Adam. They compute the same numbers up to rounding, on the same parameters 
 """
 
 import logging
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
-from torch.optim.adam import adam
+from torch.autograd.function import once_differentiable
 
 from sb3_symphony.common.ensembles import EnsembleCritic
-from sb3_symphony.common.fused import FusedNetwork, uncovered
-from sb3_symphony.common.losses import CRITIC_LOSSES
+from sb3_symphony.common.fused import FusedNetwork, array, uncovered
+from sb3_symphony.common.kernels import adam_polyak
+from sb3_symphony.common.losses import CRITIC_LOSS_SLOPES, CRITIC_LOSSES
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +68,7 @@ class CriticRegression:
         :return: The loss and the critics' values before the step
         """
         q_values = self.critic(observations, actions)  # (n_critics, batch, 1)
-        loss = self._loss(q_values, target, weights)
+        loss = self.loss(self._error(q_values, target), weights).sum()
 
         self.critic.optimizer.zero_grad()
         loss.backward()
@@ -76,15 +78,57 @@ class CriticRegression:
         polyak_update(self.running_stats, self.running_stats_target, 1.0)
         return Fit(loss.detach(), q_values.detach())
 
-    def _loss(self, q_values: th.Tensor, target: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
-        estimate = q_values if self.reduction == "independent" else q_values.mean(dim=0, keepdim=True)
-        return self.loss(target - estimate, weights).sum()
+    def _error(self, q_values: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """``(n_critics, batch, 1)``, or ``(1, batch, 1)`` if the critics' mean is what meets the target."""
+        return target - (q_values if self.reduction == "independent" else q_values.mean(dim=0, keepdim=True))
+
+    def q_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """
+        Values for the actor's step: differentiable with respect to the actions. Go back through them before the next call.
+
+        :param observations: ``(batch, ...)``
+        :param actions: ``(batch, action_dim)`` in [-1, 1]
+        :return: ``(n_critics, batch, 1)``
+        """
+        return self.critic(observations, actions)
+
+    def target_q_values(self, observations: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
+        """
+        Values of the target critics, without gradient, valid until the next call.
+
+        :param observations: ``(batch, ...)``
+        :param actions: ``(batch, action_dim)`` in [-1, 1]
+        :param members: Indices of the critics to compute, all of them by default
+        :return: ``(n_critics, batch, 1)``
+        """
+        with th.no_grad():
+            return self.critic_target(observations, actions, members)
+
+
+class _QValues(th.autograd.Function):
+    """The critics' values by hand-written passes, differentiable with respect to the actions alone."""
+
+    @staticmethod
+    def forward(ctx: Any, actions: th.Tensor, features: th.Tensor, network: FusedNetwork) -> th.Tensor:
+        ctx.network, ctx.action_dim = network, actions.shape[1]
+        ctx.values = network.forward(features, actions)
+        return ctx.values.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor, None, None]:
+        return ctx.network.action_gradient(grad, ctx.action_dim), None, None
 
 
 class FusedRegression(CriticRegression):
-    """The same by hand-written passes on workspaces kept between calls, with torch's fused Adam."""
+    """The same by hand-written passes in memory kept between calls, Adam and Polyak in one sweep."""
 
-    network: FusedNetwork | None = None
+    def __init__(self, critic: EnsembleCritic, critic_target: EnsembleCritic, loss: str, reduction: str) -> None:
+        super().__init__(critic, critic_target, loss, reduction)
+        self.slope = CRITIC_LOSS_SLOPES[loss]
+        self._networks: dict[EnsembleCritic, FusedNetwork] = {}
+        self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
+        self._addresses: list[int] = []  # of the optimiser's state, which they hold
 
     def fit(
         self,
@@ -94,51 +138,53 @@ class FusedRegression(CriticRegression):
         tau: float,
         weights: th.Tensor | None = None,
     ) -> Fit:
-        if self.network is None or len(self.network.input) != len(actions) or self.network.input.device != actions.device:
-            self.network = FusedNetwork(self.critic.q_networks, len(actions))
+        with th.no_grad():
+            network = self._network(self.critic, len(actions))
+            features = self.critic.extract_features(observations, self.critic.features_extractor)
+            q_values = network.forward(features, actions).clone()
+            error = self._error(q_values, target)
+            # d error / d q_values = -1, or -1 / n_critics where the error is that of their mean
+            network.backward(self.slope(error, weights).expand_as(q_values) * (-len(error) / len(q_values)))
+            self._step(network, tau)
+            return Fit(self.loss(error, weights).sum(), q_values)
+
+    def q_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         with th.no_grad():
             features = self.critic.extract_features(observations, self.critic.features_extractor)
-            q_values = self.network.forward(features, actions)
+        return _QValues.apply(actions, features, self._network(self.critic, len(actions)))
 
-        # The gradient with respect to the values, (n_critics, batch, 1), is left to autograd: any loss works
-        leaf = q_values.clone().requires_grad_()
-        loss = self._loss(leaf, target, weights)
-        (grad,) = th.autograd.grad(loss, leaf)
-
+    def target_q_values(self, observations: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
         with th.no_grad():
-            self.network.backward(grad)
-            self._optimizer_step(self.network)
-            targets: list[th.Tensor] = list(self.critic_target.q_networks.parameters())
-            th._foreach_lerp_(targets, self.network.parameters, tau)
-        return Fit(loss.detach(), leaf.detach())
+            features = self.critic_target.extract_features(observations, self.critic_target.features_extractor)
+            return self._network(self.critic_target, len(actions)).forward(features, actions, members)
 
-    def _optimizer_step(self, network: FusedNetwork) -> None:
+    def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
+        network = self._networks.get(critic)
+        if network is None or not network.fits(batch_size):
+            self._networks[critic] = network = FusedNetwork(critic.q_networks, batch_size)
+        return network
+
+    def _step(self, network: FusedNetwork, tau: float) -> None:
+        """Adam and Polyak of all parameters, whose state is kept where torch's optimiser keeps it."""
         optimizer = self.critic.optimizer
-        group = optimizer.param_groups[0]
-        for parameter in network.parameters:
-            if not optimizer.state[parameter]:  # as Adam itself does at its first step
-                step = th.zeros((), dtype=th.float32, device=parameter.device)
-                optimizer.state[parameter] = dict(
-                    step=step, exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter)
-                )
         states = [optimizer.state[parameter] for parameter in network.parameters]
-        adam(
-            network.parameters,
-            network.grads,
-            [state["exp_avg"] for state in states],
-            [state["exp_avg_sq"] for state in states],
-            [],
-            [state["step"] for state in states],
-            fused=True,
-            amsgrad=False,
-            maximize=False,
-            beta1=group["betas"][0],
-            beta2=group["betas"][1],
-            lr=group["lr"],
-            weight_decay=group["weight_decay"],
-            eps=group["eps"],
-            decoupled_weight_decay=isinstance(optimizer, th.optim.AdamW),
-        )
+        if not all(states):  # as Adam itself does at its first step
+            for parameter, state in zip(network.parameters, states, strict=True):
+                state["step"] = th.zeros((), dtype=th.float32)
+                state.update(exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter))
+        addresses = [id(network), *(state["exp_avg"].data_ptr() for state in states)]
+        if addresses != self._addresses:  # a state was loaded, or the batch size changed
+            self._addresses = addresses
+            self._sweeps = []
+            targets = self.critic_target.q_networks.parameters()
+            for parameter, grad, state, target in zip(network.parameters, network.grads, states, targets, strict=True):
+                tensors = (parameter, grad, state["exp_avg"], state["exp_avg_sq"], state["step"], target)
+                self._sweeps.append(partial(adam_polyak, *(array(tensor).reshape(-1) for tensor in tensors)))
+
+        group = optimizer.param_groups[0]
+        decoupled = isinstance(optimizer, th.optim.AdamW)
+        for sweep in self._sweeps:
+            sweep(group["lr"], *group["betas"], group["eps"], group["weight_decay"], decoupled, tau)
 
 
 def not_fusable(critic: EnsembleCritic) -> str | None:
@@ -149,6 +195,8 @@ def not_fusable(critic: EnsembleCritic) -> str | None:
     :return: A reason, or ``None`` if they can
     """
     optimizer = critic.optimizer
+    if critic.device.type != "cpu":
+        return f"the device is {critic.device}, not the CPU"
     if type(critic.features_extractor) is not FlattenExtractor:
         return f"the features extractor is {type(critic.features_extractor).__name__}, not FlattenExtractor"
     if (layer := uncovered(critic.q_networks)) is not None:

@@ -219,7 +219,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             for batch, next_action, entropy in zip(batches, next_actions, entropies, strict=True):
                 with th.no_grad():
                     # Minimum over the subset, one draw for the whole batch: (subset_size, batch, 1) -> (batch, 1)
-                    next_q_values = self.critic_target(batch.next_observations, next_action, self._draw_subset())
+                    next_q_values = self._regression.target_q_values(batch.next_observations, next_action, self._draw_subset())
                     next_values = combine(next_q_values, self.target_mode) + entropy.reshape(-1, 1)
                     target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
 
@@ -247,7 +247,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             self.actor.reset_noise()
         actions, log_prob = self.actor.action_log_prob(batch.observations)
         log_prob = log_prob.reshape(-1, 1)
-        actor_loss = (ent_coef * log_prob - self.critic(batch.observations, actions).mean(dim=0)).mean()
+        actor_loss = (ent_coef * log_prob - self._regression.q_values(batch.observations, actions).mean(dim=0)).mean()
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
         self.actor.optimizer.step()

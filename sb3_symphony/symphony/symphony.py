@@ -211,7 +211,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             for batch, next_action in zip(batches, next_actions, strict=True):
                 with th.no_grad():
                     # The online actor, without noise; minimum over the critics: (n_critics, batch, 1) -> (batch, 1)
-                    next_q_values = self.critic_target(batch.next_observations, next_action)
+                    next_q_values = self._regression.target_q_values(batch.next_observations, next_action)
                     next_values = combine(next_q_values, self.target_mode, self.min_mix)
                     target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
 
@@ -231,7 +231,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
         """One step of the actor toward the combined critics."""
-        q_values = combine(self.critic(batch.observations, self.actor(batch.observations)), self.target_mode, self.min_mix)
+        q_values = self._regression.q_values(batch.observations, self.actor(batch.observations))
+        q_values = combine(q_values, self.target_mode, self.min_mix)
         actor_loss = -ACTOR_LOSSES[self.actor_loss](q_values, self.baseline)
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
