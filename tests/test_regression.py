@@ -10,7 +10,7 @@ from torch import nn
 from sb3_symphony import REDQ, Symphony
 from sb3_symphony.common.layers import LeakySine
 from sb3_symphony.common.losses import CRITIC_LOSSES
-from sb3_symphony.common.regression import CriticRegression, FusedRegression, make_regression, not_fusable
+from sb3_symphony.common.regression import CriticRegression, FusedRegression, has_bfloat16, make_regression, not_fusable
 from sb3_symphony.redq.policies import REDQPolicy
 from sb3_symphony.symphony.policies import SymphonyPolicy
 
@@ -232,6 +232,40 @@ def test_single_precision(kwargs):
     for name, value in first.items():
         assert second[name].dtype == value.dtype
         assert th.norm(second[name] - value) <= 1e-3 * th.norm(value), name
+
+
+# Half precision -------------------------------------------------------------------------------------------------------
+
+native_bfloat16 = pytest.mark.skipif(not has_bfloat16(), reason="the processor has no bfloat16 arithmetic")
+
+
+@native_bfloat16
+@pytest.mark.parametrize("kwargs", [{}, dict(layer_norm=True, dropout_rate=0.1), dict(activation_fn=LeakySine)])
+def test_bfloat16_is_close(kwargs):
+    """Values and steps differ by rounding errors of 2⁻⁸ that do not add up."""
+    kwargs = dict(dtype=th.float32, net_arch=[64, 80], n_critics=3, loss="huber", **kwargs)  # 64 x 80: large enough
+    single, half = regression("fused", **kwargs), regression("bf16", **kwargs)
+    assert single.bfloat16 is False and half.bfloat16 is True
+    observations, actions, target = batch_of(64, dtype=th.float32)
+    values = []
+    for fitter in (single, half):
+        th.manual_seed(1)
+        first = fitter.target_q_values(observations, actions, [2, 0]).clone()
+        actions = actions.detach().requires_grad_()
+        (gradient,) = th.autograd.grad(fitter.q_values(observations, actions).sum(), actions)
+        fits = [fitter.fit(observations, actions.detach(), target, TAU) for _ in range(100)]
+        values.append([first, gradient, fits[0].q_values, fits[-1].q_values])
+        assert fits[-1].loss < 0.8 * fits[0].loss
+    for one, other in zip(*values, strict=True):
+        assert other.dtype == th.float32 and not th.equal(one, other)
+    for one, other in list(zip(*values, strict=True))[:3]:
+        assert th.norm(other - one) <= 0.02 * th.norm(one)
+
+
+def test_bfloat16_where_the_processor_lacks_it(small, algorithm, monkeypatch):
+    monkeypatch.setattr("sb3_symphony.common.regression.has_bfloat16", lambda: False)
+    with pytest.raises(ValueError, match=r"critic_engine='bf16' is not possible: the processor .*AVX512-BF16.*'auto'"):
+        small(algorithm, policy_kwargs=dict(critic_engine="bf16"))
 
 
 # State of the optimiser -----------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from sb3_symphony.common.losses import CRITIC_LOSS_SLOPES, CRITIC_LOSSES
 
 logger = logging.getLogger(__name__)
 
-ENGINES = ("auto", "autograd", "fused")
+ENGINES = ("auto", "autograd", "fused", "bf16")
 
 
 class Fit(NamedTuple):
@@ -121,10 +121,17 @@ class _QValues(th.autograd.Function):
 
 
 class FusedRegression(CriticRegression):
-    """The same by hand-written passes in memory kept between calls, Adam and Polyak in one sweep."""
+    """
+    The same by hand-written passes in memory kept between calls, Adam and Polyak in one sweep.
 
-    def __init__(self, critic: EnsembleCritic, critic_target: EnsembleCritic, loss: str, reduction: str) -> None:
+    :param bfloat16: Whether to round the operands of large products, see :class:`~sb3_symphony.common.fused.BFloat16Products`
+    """
+
+    def __init__(
+        self, critic: EnsembleCritic, critic_target: EnsembleCritic, loss: str, reduction: str, bfloat16: bool = False
+    ) -> None:
         super().__init__(critic, critic_target, loss, reduction)
+        self.bfloat16 = bfloat16
         self.slope = CRITIC_LOSS_SLOPES[loss]
         self._networks: dict[EnsembleCritic, FusedNetwork] = {}
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
@@ -161,7 +168,7 @@ class FusedRegression(CriticRegression):
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
         network = self._networks.get(critic)
         if network is None or not network.fits(batch_size):
-            self._networks[critic] = network = FusedNetwork(critic.q_networks, batch_size)
+            self._networks[critic] = network = FusedNetwork(critic.q_networks, batch_size, self.bfloat16)
         return network
 
     def _step(self, network: FusedNetwork, tau: float) -> None:
@@ -209,6 +216,12 @@ def not_fusable(critic: EnsembleCritic) -> str | None:
     return f"the optimizer has {special[0]}=True" if special else None
 
 
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 natively: AVX512-BF16, AMX or ARM's BF16."""
+    capabilities = th.cpu.get_capabilities() if hasattr(th.cpu, "get_capabilities") else {}
+    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16", "bf16"))
+
+
 def make_regression(
     critic: EnsembleCritic, critic_target: EnsembleCritic, loss: str, reduction: str, engine: str = "auto"
 ) -> CriticRegression:
@@ -219,13 +232,17 @@ def make_regression(
     :param critic_target: Their targets
     :param loss: Error function by name
     :param reduction: ``"independent"`` or ``"ensemble_mean"``
-    :param engine: ``"auto"`` (fused if possible), ``"autograd"`` or ``"fused"``
-    :raises ValueError: if ``engine="fused"`` cannot be, saying why
+    :param engine: ``"auto"`` (fused if possible), ``"autograd"``, ``"fused"``, or ``"bf16"``: fused, with large products in
+        bfloat16
+    :raises ValueError: if ``"fused"`` or ``"bf16"`` cannot be, saying why
     """
     reason = not_fusable(critic)
-    if engine == "fused" and reason is not None:
-        raise ValueError(f"critic_engine='fused' is not possible: {reason}; expected critic_engine='auto' or 'autograd'")
+    if engine == "bf16" and reason is None and not has_bfloat16():
+        reason = "the processor has no bfloat16 arithmetic (AVX512-BF16 or AMX)"
+    if engine in ("fused", "bf16") and reason is not None:
+        raise ValueError(f"critic_engine='{engine}' is not possible: {reason}; expected critic_engine='auto' or 'autograd'")
     if engine == "auto" and reason is not None:
         logger.info("critics are fitted by autograd: %s", reason)
-    chosen = CriticRegression if engine == "autograd" or reason is not None else FusedRegression
-    return chosen(critic, critic_target, loss, reduction)
+    if engine == "autograd" or reason is not None:
+        return CriticRegression(critic, critic_target, loss, reduction)
+    return FusedRegression(critic, critic_target, loss, reduction, bfloat16=engine == "bf16")

@@ -43,7 +43,8 @@ class REDQPolicy(SACPolicy):
     :param layer_norm: Whether the critics normalise each hidden layer before its activation
     :param dropout_rate: Dropout after the critics' hidden linear layers, active in the targets too (DroQ)
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
-        fused wherever it is possible. The results are equal up to rounding
+        fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
+        bfloat16, twice as fast on processors that have it and less precise
     """
 
     critic: EnsembleCritic  # type: ignore[assignment]
