@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 from sb3_symphony.common.checks import suggestion
@@ -16,13 +17,29 @@ from sb3_symphony.experiment.config import (
     validated,
 )
 from sb3_symphony.experiment.registry import ALGORITHMS
-from sb3_symphony.experiment.select import SelectOptions
+from sb3_symphony.experiment.select import EnjoyOptions, EvaluateOptions, ExportOptions, SelectOptions
 
 _TRAIN_EXAMPLES = """examples:
   sb3-symphony train                                  Symphony learns to walk
   sb3-symphony train --algo sac --env Pendulum-v1 --seed 0
   sb3-symphony train --algo redq -n 50000 -params gradient_steps:5 policy_kwargs.net_arch:[64,64]
   sb3-symphony train -conf logs/symphony/BipedalWalker-v3_1/BipedalWalker-v3/config.yml
+  sb3-symphony train --resume logs/symphony/BipedalWalker-v3_1
+"""
+
+_EVALUATE_EXAMPLES = """examples:
+  sb3-symphony evaluate --algo sac --env Pendulum-v1 --load-best
+  sb3-symphony evaluate --model ppo.zip --algo ppo --env Hopper-v5 --vecnormalize stats.pkl --json out.json
+  sb3-symphony evaluate --model logs/sac/Pendulum-v1_1 --obs-noise 0.05 --action-delay 2
+"""
+_ENJOY_EXAMPLES = """examples:
+  sb3-symphony enjoy                                   the latest run of Symphony on BipedalWalker-v3
+  sb3-symphony enjoy --algo sac --env Pendulum-v1 --load-best -n 5000
+  sb3-symphony enjoy --model logs/sac/Pendulum-v1_1 --seed 20017 --no-render
+"""
+_EXPORT_EXAMPLES = """examples:
+  sb3-symphony export --algo sac --env Pendulum-v1 --load-best
+  sb3-symphony export --model ppo.zip --algo ppo --env Hopper-v5 --vecnormalize stats.pkl -o robot.onnx
 """
 
 
@@ -73,33 +90,37 @@ def _add_train(commands: Any) -> None:
         description="Train an agent; files go to <log-folder>/<algo>/<env>_<k>/.",
         epilog=_TRAIN_EXAMPLES,
     )
-    add = parser.add_argument
-    add("--algo", metavar="ALGO", help=f"{', '.join(ALGORITHMS)} (default: %(default)s)")
-    add("--env", metavar="ID", help="registered environment (default: %(default)s)")
+    # Only what is given reaches the options, so that --resume can tell it from the defaults
+    add = partial(parser.add_argument, default=argparse.SUPPRESS)
+    default = TrainOptions()
+    add("--algo", metavar="ALGO", help=f"{', '.join(ALGORITHMS)} (default: {default.algo})")
+    add("--env", metavar="ID", help=f"registered environment (default: {default.env})")
     add("-n", "--n-timesteps", type=_whole_number, metavar="N", help="environment steps (default: the configuration's)")
-    add("--seed", type=_whole_number, metavar="N", help="seed; -1 draws one (default: %(default)s)")
-    add("-f", "--log-folder", metavar="DIR", help="where runs are kept (default: %(default)s)")
-    add("--eval-freq", type=_whole_number, metavar="N", help="steps between evaluations, 0: none (default: %(default)s)")
-    add("--eval-episodes", type=_whole_number, metavar="N", help="episodes of an evaluation (default: %(default)s)")
+    add("--seed", type=_whole_number, metavar="N", help=f"seed; -1 draws one (default: {default.seed})")
+    add("-f", "--log-folder", metavar="DIR", help=f"where runs are kept (default: {default.log_folder})")
+    every, episodes = f"(default: {default.eval_freq})", f"(default: {default.eval_episodes})"
+    add("--eval-freq", type=_whole_number, metavar="N", help=f"steps between evaluations, 0: none {every}")
+    add("--eval-episodes", type=_whole_number, metavar="N", help=f"episodes of an evaluation {episodes}")
     add("-params", "--hyperparams", nargs="+", metavar="K:V", help="override hyper-parameters; values are YAML")
     add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset to use, e.g. symphony-original (default: shipped)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
     add("-tb", "--tensorboard-log", metavar="DIR", help="write TensorBoard logs there")
-    add("--save-freq", type=_whole_number, metavar="N", help="steps between saved models, -1: none (default: %(default)s)")
-    add("--device", help="auto, cpu or cuda (default: %(default)s)")
+    add("--save-freq", type=_whole_number, metavar="N", help="steps between checkpoints (default: none)")
+    add("--keep", type=_whole_number, metavar="K", help=f"checkpoints to keep (default: {default.keep})")
+    add("--resume", metavar="RUN_FOLDER", help="go on with a run from its newest checkpoint, up to its -n or a larger one")
+    add("--device", help=f"auto, cpu or cuda (default: {default.device})")
     add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch (default: PyTorch's)")
     add("--log-interval", type=_whole_number, metavar="N", help="episodes between log lines, -1: default, -2: none")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
     add("--verbose", type=int, choices=(0, 1, 2), help="log to the terminal (default: 1, with a progress bar 0)")
-    defaults = TrainOptions().model_dump()
-    parser.set_defaults(run=_train, parser=parser, **{**defaults, "hyperparams": [], "env_kwargs": []})
+    parser.set_defaults(run=_train, parser=parser)
 
 
 def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
-    arguments["hyperparams"] = parse_pairs(arguments["hyperparams"], "-params")
-    arguments["env_kwargs"] = parse_pairs(arguments["env_kwargs"], "--env-kwargs")
-    if arguments["progress"] is None:
-        arguments["progress"] = sys.stdout.isatty()
+    for name, flag in (("hyperparams", "-params"), ("env_kwargs", "--env-kwargs")):
+        if name in arguments:
+            arguments[name] = parse_pairs(arguments[name], flag)
+    arguments.setdefault("progress", sys.stdout.isatty())
     options = validated(TrainOptions, arguments)
     check_algorithm(options.algo)  # before the slow imports
 
@@ -112,21 +133,123 @@ def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:
     """The flags of :class:`SelectOptions`, which all commands on trained agents share."""
-    add = parser.add_argument_group("which agent").add_argument
-    add("--model", metavar="PATH", help="model's zip file, or run folder (default: looked for by the next flags)")
-    add("--algo", metavar="ALGO", help="its algorithm (default: the run's, or symphony)")
-    add("--env", metavar="ID", help="its environment (default: the run's, or BipedalWalker-v3)")
-    add("-f", "--folder", metavar="DIR", help="where runs are kept (default: %(default)s)")
-    add("--exp-id", type=_whole_number, metavar="N", help="number of the run; 0: latest, -1: no run folder (default: 0)")
-    add("--load-best", action="store_true", help="model with the best evaluation instead of the last")
+    add = partial(parser.add_argument_group("which agent").add_argument, default=argparse.SUPPRESS)
+    add("--model", metavar="PATH", help="model's zip file, or a run folder (default: found by the next flags)")
+    add("--algo", metavar="ALGO", help="its algorithm (default: the run's; without --model symphony)")
+    add("--env", metavar="ID", help="its environment (default: the run's; without --model BipedalWalker-v3)")
+    add("-f", "--folder", metavar="DIR", help=f"where runs are kept (default: {SelectOptions().folder})")
+    add("--exp-id", type=_whole_number, metavar="N", help="number of the run; -1: no run folder (default: 0, the latest)")
+    add("--load-best", action="store_true", help="model with the best evaluation instead of the last one")
     add("--load-checkpoint", type=_whole_number, metavar="N", help="model saved after N steps")
-    add("--load-last-checkpoint", action="store_true", help="model saved last")
+    add("--load-last-checkpoint", action="store_true", help="model saved latest, of a run that did not end")
     add("--vecnormalize", metavar="PKL", help="statistics of VecNormalize (default: the run's)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
     add("--gym-packages", nargs="+", metavar="M", help="modules to import, which register environments")
-    add("--device", help="auto, cpu or cuda (default: %(default)s)")
-    add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch (default: PyTorch's)")
-    parser.set_defaults(**{**SelectOptions().model_dump(), "env_kwargs": []})
+    add("--device", help="auto, cpu or cuda (default: auto)")
+    add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch")
+
+
+def _add_deterministic(parser: argparse.ArgumentParser) -> None:
+    either = parser.add_mutually_exclusive_group()
+    add = partial(either.add_argument, dest="deterministic", default=argparse.SUPPRESS)
+    add("--deterministic", action="store_true", help="ask the policy for its mode (default)")
+    add("--stochastic", action="store_false", help="ask it for samples")
+
+
+def _selection(model: type[SelectOptions], arguments: dict[str, Any]) -> Any:
+    """The options of a command on a trained agent."""
+    if "env_kwargs" in arguments:
+        arguments["env_kwargs"] = parse_pairs(arguments["env_kwargs"], "--env-kwargs")
+    return validated(model, arguments)
+
+
+def _add_evaluate(commands: Any) -> None:
+    parser = commands.add_parser(
+        "evaluate",
+        help="returns of a trained agent over many episodes",
+        usage="%(prog)s [which agent] [options]",
+        description="Play episodes with an agent trained by this package, Stable-Baselines3 or SB3-Contrib.",
+        epilog=_EVALUATE_EXAMPLES,
+    )
+    _add_selection(parser)
+    add = partial(parser.add_argument, default=argparse.SUPPRESS)
+    default = EvaluateOptions()
+    add("-n", "--n-episodes", type=_whole_number, metavar="N", help=f"episodes (default: {default.n_episodes})")
+    add("--seed", type=_whole_number, metavar="N", help=f"episode i has environment seed N + i (default: {default.seed})")
+    _add_deterministic(parser)
+    add("--n-envs", type=_whole_number, metavar="N", help="processes, results do not depend on it (default: 1)")
+    add("--obs-noise", type=float, metavar="S", help="Gaussian noise on observations, std in their units (default: 0)")
+    add("--action-delay", type=_whole_number, metavar="K", help="steps from an action to its effect (default: 0)")
+    add("--json", dest="json_file", metavar="OUT", help="write results as JSON; -: print them so")
+    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
+    parser.set_defaults(run=_evaluate, parser=parser)
+
+
+def _evaluate(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    arguments.setdefault("progress", sys.stderr.isatty())
+    options = _selection(EvaluateOptions, arguments)
+
+    from sb3_symphony.experiment.evaluate import evaluate
+
+    result = evaluate(options)
+    print(result.as_json() if options.json_file == "-" else result)
+    return 0
+
+
+def _add_enjoy(commands: Any) -> None:
+    parser = commands.add_parser(
+        "enjoy",
+        help="watch a trained agent",
+        usage="%(prog)s [which agent] [options]",
+        description="Let a trained agent act, in a window or without one, and print the returns of its episodes.",
+        epilog=_ENJOY_EXAMPLES,
+    )
+    _add_selection(parser)
+    add = partial(parser.add_argument, default=argparse.SUPPRESS)
+    default = EnjoyOptions()
+    add("-n", "--n-timesteps", type=_whole_number, metavar="N", help=f"steps (default: {default.n_timesteps})")
+    add("--n-envs", type=_whole_number, metavar="N", help="copies of the environment (default: 1)")
+    add("--seed", type=_whole_number, metavar="N", help=f"seed of the first episode (default: {default.seed})")
+    _add_deterministic(parser)
+    add("--no-render", dest="render", action="store_false", help="no window")
+    add("--norm-reward", action="store_true", help="also show returns as normalised in training")
+    add("--reward-log", metavar="DIR", help="write the episodes as Monitor files there")
+    add("-P", "--progress", action="store_true", help="progress bar")
+    # Needed by RL Zoo for old files, always so here
+    parser.add_argument("--custom-objects", action="store_true", help=argparse.SUPPRESS)
+    parser.set_defaults(run=_enjoy, parser=parser)
+
+
+def _enjoy(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    del arguments["custom_objects"]
+    options = _selection(EnjoyOptions, arguments)
+
+    from sb3_symphony.experiment.enjoy import enjoy
+
+    enjoy(options)
+    return 0
+
+
+def _add_export(commands: Any) -> None:
+    parser = commands.add_parser(
+        "export",
+        help="write a trained actor as ONNX",
+        usage="%(prog)s [which agent] [-o FILE]",
+        description="Write a trained actor as ONNX: raw observation in, action in the environment's units out.",
+        epilog=_EXPORT_EXAMPLES,
+    )
+    _add_selection(parser)
+    parser.add_argument("-o", "--output", metavar="FILE", help="ONNX file (default: the model's name with .onnx)")
+    parser.set_defaults(run=_export, parser=parser)
+
+
+def _export(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    options = _selection(ExportOptions, arguments)
+
+    from sb3_symphony.experiment.export import export
+
+    print(export(options))
+    return 0
 
 
 def _add_list(commands: Any) -> None:
@@ -159,6 +282,9 @@ def make_parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     _add_train(commands)
+    _add_enjoy(commands)
+    _add_evaluate(commands)
+    _add_export(commands)
     _add_list(commands)
     return parser
 

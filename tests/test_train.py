@@ -50,6 +50,7 @@ def test_run_folder(folder, capsys):
         "Pendulum-v1",
         "Pendulum-v1.zip",
         "best_model.zip",
+        "checkpoints",
         "evaluations.npz",
         "rl_model_300_steps.zip",
         "training.png",

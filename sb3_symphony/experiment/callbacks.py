@@ -24,21 +24,27 @@ from stable_baselines3.common.vec_env import VecEnv
 
 class StopOnSignal(BaseCallback):
     """
-    Ends training after the current step when Ctrl-C is pressed or the process is asked to terminate.
+    Ends training when Ctrl-C is pressed or the process is asked to terminate.
 
     Stopping between two steps leaves model, replay and files whole. A second signal does not wait.
+
+    :param at_rollouts: stop where the next rollout has begun (a checkpoint can be made there, in
+        ``_on_rollout_start``), not already after the current step
     """
 
-    def __init__(self) -> None:
+    def __init__(self, at_rollouts: bool = False) -> None:
         super().__init__()
+        self.at_rollouts = at_rollouts
         self.requested = False
+        self.now = False  # whether to stop after the current step
 
     def _handle(self, signum: int, frame: Any) -> None:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+        self.now = not self.at_rollouts
         # Not print(): a signal may arrive inside one
-        os.write(2, b"\nstopping after this step and saving the model (once more: at once)\n")
+        os.write(2, b"\nstopping as soon as all can be saved (once more: at once)\n")
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -53,8 +59,11 @@ class StopOnSignal(BaseCallback):
             for number, handler in before.items():
                 signal.signal(number, handler)
 
+    def _on_rollout_start(self) -> None:
+        self.now = self.requested
+
     def _on_step(self) -> bool:
-        return not self.requested
+        return not self.now
 
 
 class _EvaluationAborted(Exception):
@@ -93,7 +102,7 @@ class SeededEvaluation(EvalCallback):
         self.stop = stop
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        if self.stop.requested:
+        if self.stop.now:
             raise _EvaluationAborted
         super()._log_success_callback(locals_, globals_)
 
@@ -129,6 +138,12 @@ class ReturnProgressBar(BaseCallback):
     def _on_training_start(self) -> None:
         self.progress.start()
         self.task = self.progress.add_task("", total=self.locals["total_timesteps"])
+        self.started = False
+
+    def _on_rollout_start(self) -> None:
+        if not self.started:  # a resumed run begins here, which is no progress of this process
+            self.progress.reset(self.task, completed=self.model.num_timesteps)
+            self.started = True
 
     def _on_step(self) -> bool:
         self.progress.update(self.task, completed=self.num_timesteps)

@@ -188,7 +188,9 @@ class TrainOptions(BaseModel):
     conf_file: str | None = None
     env_kwargs: dict[str, Any] = {}
     tensorboard_log: str = ""
-    save_freq: int = -1
+    save_freq: int = Field(default=-1, ge=-1)
+    keep: int = Field(default=2, ge=1)
+    resume: str | None = None
     device: str = "auto"
     num_threads: int = -1
     log_interval: int = Field(default=-1, ge=-2)

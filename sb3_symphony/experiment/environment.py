@@ -238,12 +238,13 @@ def make_evaluation_env(env_id: str, settings: RunSettings) -> VecEnv:
     return stacked(_normalized(DummyVecEnv([evaluation_env]), settings, None, training=False), settings)
 
 
-def attach_monitor_files(env: VecEnv, folder: Path) -> None:
+def attach_monitor_files(env: VecEnv, folder: Path, append: bool = False) -> None:
     """
     Let the monitors write ``<i>.monitor.csv``. Separate, since a run folder exists only once everything else is known good.
 
     :param env: training environment
     :param folder: run folder
+    :param append: go on with files that are there
     """
     copies = env.unwrapped
     assert isinstance(copies, DummyVecEnv)
@@ -252,4 +253,4 @@ def attach_monitor_files(env: VecEnv, folder: Path) -> None:
         assert isinstance(monitor, Monitor)
         monitor.t_start = time.time()
         header: dict[str, float | str] = {"t_start": monitor.t_start, "env_id": str(copy.spec.id if copy.spec else None)}
-        monitor.results_writer = ResultsWriter(str(folder / str(index)), header=header)
+        monitor.results_writer = ResultsWriter(str(folder / str(index)), header=header, override_existing=not append)

@@ -92,6 +92,20 @@ class RunFolder:
         return self.path / "best_model_vecnormalize.pkl"
 
     @property
+    def checkpoints(self) -> Path:
+        """Folder of what the run resumes from."""
+        return self.path / "checkpoints"
+
+    @property
+    def command(self) -> str:
+        """The command lines the run was started and resumed with."""
+        return (self.details / "command.txt").read_text(encoding="utf-8").strip()
+
+    def growing_files(self) -> list[Path]:
+        """:return: files that get longer while training, as far as they are there"""
+        return [*sorted(self.path.glob("*.monitor.csv")), *self.path.glob("evaluations.npz")]
+
+    @property
     def plot(self) -> Path:
         """Curve of returns."""
         return self.path / "training.png"
@@ -104,6 +118,9 @@ class RunFolder:
         :param config: merged hyper-parameters, which ``-conf`` reads back
         :param command: the command line
         """
-        (self.details / "args.yml").write_text(yaml.safe_dump(options, sort_keys=False), encoding="utf-8")
-        (self.details / "config.yml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
-        (self.details / "command.txt").write_text(command + "\n", encoding="utf-8")
+        contents = {"config.yml": yaml.safe_dump(config, sort_keys=False), "command.txt": command + "\n"}
+        contents["args.yml"] = yaml.safe_dump(options, sort_keys=False)  # the last one: a folder that has it is complete
+        for name, content in contents.items():
+            temporary = self.details / f".{name}.tmp"
+            temporary.write_text(content, encoding="utf-8")
+            temporary.replace(self.details / name)

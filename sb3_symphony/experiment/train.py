@@ -1,18 +1,23 @@
 """One training run, from options to files on disk."""
 
+import io
 import shlex
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
+from filelock import FileLock, Timeout
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.plots import plot_training
+from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of, record_episodes, write_atomically
 from sb3_symphony.experiment.callbacks import ReturnProgressBar, SaveNormalization, SeededEvaluation, StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config
 from sb3_symphony.experiment.decode import algorithm_arguments
@@ -23,6 +28,7 @@ from sb3_symphony.experiment.environment import (
     make_training_env,
 )
 from sb3_symphony.experiment.registry import load_algorithm
+from sb3_symphony.experiment.resume import open_run, restore_files
 from sb3_symphony.experiment.run_folder import RunFolder
 
 
@@ -34,18 +40,22 @@ class TrainResult:
     :param run: its folder
     :param steps: environment steps taken
     :param evaluation: returns of the last evaluation's episodes, empty if there was none
-    :param seconds: wall-clock time of learning
+    :param seconds: wall-clock time of learning, that before a resume included
     :param interrupted: whether it was stopped by a signal
+    :param untouched: whether there was nothing left to do in a run that was to be resumed
     """
 
     run: RunFolder
     steps: int
     evaluation: list[float]
     seconds: float
-    interrupted: bool
+    interrupted: bool = False
+    untouched: bool = False
 
     def summary(self) -> str:
         """:return: one line for the end of a run"""
+        if self.untouched:
+            return f"{self.run.path} is finished: {self.steps} steps — nothing changed (a larger -n goes on)"
         evaluated = "not evaluated"
         if self.evaluation:
             mean, spread = np.mean(self.evaluation), np.std(self.evaluation)
@@ -109,7 +119,7 @@ def _evaluation(
     )
 
 
-def _checkpoints(options: TrainOptions, config: RunConfig, run: RunFolder) -> CheckpointCallback:
+def _saved_models(options: TrainOptions, config: RunConfig, run: RunFolder) -> CheckpointCallback:
     frequency = max(options.save_freq // config.settings.n_envs, 1)
     return CheckpointCallback(frequency, str(run.path), save_vecnormalize=True)
 
@@ -121,18 +131,79 @@ def _writable(folder: str, flag: str) -> None:
         raise ConfigError(f"{flag}: '{folder}' cannot be written — {error.strerror}") from None
 
 
+@contextmanager
+def _alone(run: RunFolder) -> Iterator[None]:
+    """No other process trains this run meanwhile; the system releases the lock of one that was killed."""
+    try:
+        with FileLock(run.checkpoints / ".lock", timeout=0):
+            yield
+    except Timeout:
+        raise ConfigError(f"--resume: '{run.path}' is being trained by another process") from None
+
+
+def _resuming(checkpoint: Checkpoint | None, model: BaseAlgorithm) -> str:
+    """What a resumed run begins with, in words."""
+    if checkpoint is None:
+        return "stopped before its first checkpoint, begins again"
+    before, now = checkpoint.state["platform"], platform_of(model)
+    changes = [f"{name} {before.get(name)} before, {value} now" for name, value in now.items() if before.get(name) != value]
+    notes = [f"damaged: {line}" for line in checkpoint.damaged]
+    notes += [f"not bit for bit: {', '.join(changes)}"] if changes else []
+    return "; ".join([f"resumed at {checkpoint.steps}", *notes])
+
+
+def _callbacks(
+    options: TrainOptions, config: RunConfig, run: RunFolder, evaluation_env: VecEnv | None, verbose: int
+) -> tuple[StopOnSignal, SeededEvaluation | None, list[BaseCallback]]:
+    """Those that have a part in the run's results, and what the list ends with, in the order they are called."""
+    stop = StopOnSignal(at_rollouts=options.save_freq > 0)
+    evaluation = None if evaluation_env is None else _evaluation(options, config, run, evaluation_env, stop, verbose)
+    callbacks: list[BaseCallback] = [stop, *([evaluation] if evaluation else [])]
+    if options.save_freq > 0:
+        callbacks.append(_saved_models(options, config, run))
+    return stop, evaluation, callbacks
+
+
+def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
+    """The model comes last and at once: a run whose model has all steps has everything."""
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        normalization.save(str(run.normalization))
+    plot_training(run.path)
+    content = io.BytesIO()
+    model.save(content)
+    write_atomically(run.model, content.getvalue())
+
+
 def train(options: TrainOptions, command: str | None = None) -> TrainResult:
     """
-    Train one agent and write its run folder.
+    Train one agent and write its run folder, or go on with a run that was stopped.
 
     The folder is made once everything has been validated and the model built, so a mistake leaves nothing behind.
 
-    :param options: options of the command line
+    :param options: options of the command line; with ``resume`` set, only those that were given
     :param command: the command line, for ``command.txt``
     :return: what the run left behind
     :raises ConfigError: if options or configuration are wrong
     """
-    config = load_config(options)
+    with ExitStack() as cleanup:
+        if options.resume is None:
+            return _train(options, load_config(options), command, cleanup)
+        stored = open_run(options)
+        if stored.finished:
+            return TrainResult(stored.run, stored.steps, [], 0.0, untouched=True)
+        cleanup.enter_context(_alone(stored.run))
+        return _train(stored.options, stored.config, command, cleanup, stored.run, stored.checkpoint())
+
+
+def _train(
+    options: TrainOptions,
+    config: RunConfig,
+    command: str | None,
+    cleanup: ExitStack,
+    run: RunFolder | None = None,
+    checkpoint: Checkpoint | None = None,
+) -> TrainResult:
     seed = options.seed if options.seed >= 0 else int(np.random.default_rng().integers(2**31))
     verbose = options.verbose if options.verbose is not None else int(not options.progress)
     if options.num_threads > 0:
@@ -141,55 +212,67 @@ def train(options: TrainOptions, command: str | None = None) -> TrainResult:
     model = build_model(options, config, seed, verbose)
     env = model.get_env()
     assert env is not None
+    cleanup.callback(env.close)
     evaluation_env = make_evaluation_env(options.env, config.settings) if options.eval_freq > 0 else None
-    bar: ReturnProgressBar | None = None
-    try:
-        if options.tensorboard_log:
-            _writable(options.tensorboard_log, "--tensorboard-log")
+    if evaluation_env is not None:
+        cleanup.callback(evaluation_env.close)
+    if options.tensorboard_log:
+        _writable(options.tensorboard_log, "--tensorboard-log")
+
+    used = options.model_copy(update={"seed": seed, "n_timesteps": config.settings.n_timesteps, "verbose": verbose})
+    command = command or f"sb3-symphony train --algo {options.algo} --env {shlex.quote(options.env)}"
+    beginning = ""
+    if run is None:
         run = RunFolder.create(options.log_folder, options.algo, options.env)
-        used = options.model_copy(update={"seed": seed, "n_timesteps": config.settings.n_timesteps, "verbose": verbose})
-        command = command or f"sb3-symphony train --algo {options.algo} --env {shlex.quote(options.env)}"
+        if options.save_freq > 0:
+            run.checkpoints.mkdir()
+            cleanup.enter_context(_alone(run))
         if options.seed < 0:
             command += f" --seed {seed}"  # so that the command repeats this run
-        run.write_configuration(used.model_dump(), config.plain, command)
-        attach_monitor_files(env, run.path)
+    else:
+        beginning = f" ({_resuming(checkpoint, model)})"
+        command = f"{run.command}\n{command}"
+        restore_files(run, checkpoint)
+    run.write_configuration(used.model_dump(exclude={"resume"}), config.plain, command)
+    attach_monitor_files(env, run.path, append=checkpoint is not None)
 
-        stop = StopOnSignal()
-        callbacks: list[BaseCallback] = [stop]
-        evaluation = None
-        if evaluation_env is not None:
-            evaluation = _evaluation(options, config, run, evaluation_env, stop, verbose)
-            callbacks.append(evaluation)
-        if options.save_freq > 0:
-            callbacks.append(_checkpoints(options, config, run))
+    stop, evaluation, callbacks = _callbacks(options, config, run, evaluation_env, verbose)
+    checkpoints = None
+    if options.save_freq > 0:
+        record_episodes(env)
+        checkpoints = ExactCheckpoints(
+            run.checkpoints,
+            options.save_freq,
+            options.keep,
+            callbacks=tuple(callbacks),
+            files=run.growing_files,
+            checkpoint=checkpoint,
+            wanted=lambda: stop.requested,
+        )
+        callbacks.append(checkpoints)
+    if options.progress:
+        bar = ReturnProgressBar(evaluation)
+        callbacks.append(bar)
+        cleanup.callback(bar.close)
+
+    total = config.settings.n_timesteps
+    print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
+    with stop.listening():
+        learn_arguments: dict[str, Any] = {}
+        if options.log_interval != -1:
+            learn_arguments["log_interval"] = None if options.log_interval == -2 else options.log_interval
+        try:
+            model.learn(total, callback=callbacks, **learn_arguments)
+        except KeyboardInterrupt:
+            stop.requested = True
+        seconds = (time.time_ns() - model.start_time) / 1e9
         if options.progress:
-            bar = ReturnProgressBar(evaluation)
-            callbacks.append(bar)
-
-        print(f"{options.algo} on {options.env}, seed {seed}: {config.settings.n_timesteps} steps into {run.path}", flush=True)
-        start = time.perf_counter()
-        with stop.listening():
-            learn_arguments: dict[str, Any] = {}
-            if options.log_interval != -1:
-                learn_arguments["log_interval"] = None if options.log_interval == -2 else options.log_interval
-            try:
-                model.learn(config.settings.n_timesteps, callback=callbacks, **learn_arguments)
-            except KeyboardInterrupt:
-                stop.requested = True
-            seconds = time.perf_counter() - start
-            if bar is not None:
-                bar.close()
-            model.save(run.model)
-            normalization = model.get_vec_normalize_env()
-            if normalization is not None:
-                normalization.save(str(run.normalization))
-            plot_training(run.path)
-        results = evaluation.evaluations_results if evaluation is not None else []
-        last = [float(value) for value in results[-1]] if results else []
-        return TrainResult(run, model.num_timesteps, last, seconds, stop.requested)
-    finally:
-        if bar is not None:
             bar.close()
-        env.close()
-        if evaluation_env is not None:
-            evaluation_env.close()
+        complete = checkpoints is not None and checkpoints.complete
+        if checkpoints is None or checkpoints.restored:
+            _save_model(model, run)
+        if checkpoints is not None and complete:
+            checkpoints.save(rollout_follows=False)
+    results = evaluation.evaluations_results if evaluation is not None else []
+    last = [float(value) for value in results[-1]] if results else []
+    return TrainResult(run, model.num_timesteps, last, seconds, stop.requested and not complete)

@@ -1,0 +1,123 @@
+"""A run that was stopped, killed or finished, and how it goes on."""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from sb3_symphony.common.checkpoint import Checkpoint, DamagedCheckpoint, newest_checkpoint, write_atomically
+from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
+from sb3_symphony.experiment.run_folder import RunFolder
+
+#: options that may differ from those the run was started with; nothing that is learned depends on them
+_CHANGEABLE = {"n_timesteps", "save_freq", "keep", "verbose", "progress"}
+
+
+@dataclass
+class StoredRun:
+    """
+    A run as its folder tells it.
+
+    :param run: its folder
+    :param options: options to go on with
+    :param config: configuration to go on with
+    :param steps: environment steps of the model at its end, 0 if there is none
+    """
+
+    run: RunFolder
+    options: TrainOptions
+    config: RunConfig
+    steps: int
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.steps >= self.config.settings.n_timesteps
+
+    def checkpoint(self) -> Checkpoint | None:
+        """
+        :return: where to go on from; None if the run was stopped before its first checkpoint, and begins again
+        :raises ConfigError: if no checkpoint is whole, or it is beyond the end that is asked for
+        """
+        try:
+            checkpoint = newest_checkpoint(self.run.checkpoints)
+        except DamagedCheckpoint as error:
+            raise ConfigError(f"--resume: no checkpoint of '{self.run.path}' is whole — {error}") from None
+        if checkpoint is not None and checkpoint.steps >= self.config.settings.n_timesteps:
+            n_timesteps = self.config.settings.n_timesteps
+            raise ConfigError(f"-n: {n_timesteps} — the run has taken {checkpoint.steps} steps already, expected more")
+        return checkpoint
+
+
+def _spelling(name: str) -> str:
+    short = {"n_timesteps": "-n", "hyperparams": "-params", "conf_file": "-conf"}
+    return short.get(name, "--" + name.replace("_", "-"))
+
+
+def model_steps(path: Path) -> int:
+    """
+    :param path: model saved by SB3
+    :return: environment steps it was trained for, 0 if there is no such file or it is damaged
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return int(json.loads(archive.read("data"))["num_timesteps"])
+    except (OSError, zipfile.BadZipFile, ValueError, KeyError, TypeError):
+        return 0
+
+
+def open_run(options: TrainOptions) -> StoredRun:
+    """
+    Read the folder of a run that is to go on. Nothing is changed.
+
+    :param options: ``resume``, and other options as far as they are given
+    :return: the run
+    :raises ConfigError: if it is no such folder, another option contradicts it, or it has no checkpoints
+    """
+    assert options.resume is not None
+    folder = Path(options.resume)
+    found = sorted(folder.glob("*/args.yml"))
+    if len(found) != 1:
+        what = "no run folder (no <env>/args.yml in it)" if folder.is_dir() else "no such folder"
+        raise ConfigError(f"--resume: '{folder}' — {what}; expected one such as logs/symphony/BipedalWalker-v3_1")
+    run = RunFolder(folder, found[0].parent.name)
+    stored: TrainOptions = validated(TrainOptions, read_yaml(found[0]))
+
+    given = {name: getattr(options, name) for name in options.model_fields_set - {"resume"}}
+    for name, value in given.items():
+        if name not in _CHANGEABLE and value != getattr(stored, name):
+            allowed = ", ".join(map(_spelling, sorted(_CHANGEABLE)))
+            raise ConfigError(
+                f"{_spelling(name)}: {value!r} contradicts the run, which has {getattr(stored, name)!r} — "
+                f"with --resume only {allowed} may differ"
+            )
+    changed = {name: value for name, value in given.items() if name in _CHANGEABLE}
+    if "progress" in changed:
+        changed.setdefault("verbose", None)  # which depends on it
+    resumed = stored.model_copy(update=changed)
+    # The run's own file, not the shipped one, which may have changed since
+    source = {"conf_file": str(run.details / "config.yml"), "hyperparams": {}, "env_kwargs": {}}
+    source["n_timesteps"] = changed.get("n_timesteps", -1)
+    config = load_config(stored.model_copy(update=source))
+
+    result = StoredRun(run, resumed, config, model_steps(run.model))
+    if not result.finished and not run.checkpoints.is_dir():
+        raise ConfigError(f"--resume: '{folder}' has no checkpoints — it was started without --save-freq")
+    if not result.finished and resumed.save_freq <= 0:
+        raise ConfigError(f"--save-freq: {resumed.save_freq} — expected a number > 0 for a run that is resumed")
+    return result
+
+
+def restore_files(run: RunFolder, checkpoint: Checkpoint | None) -> None:
+    """
+    Give the files that grow in the course of a run the content they had at a checkpoint; without one, remove them.
+
+    :param run: folder of the run
+    :param checkpoint: where to go on from
+    """
+    contents = checkpoint.state["files"] if checkpoint else {}
+    for path in run.growing_files():
+        if path.name not in contents:
+            path.unlink()
+    for name, content in contents.items():
+        write_atomically(run.path / name, content)
