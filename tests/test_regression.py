@@ -259,7 +259,7 @@ def test_bfloat16_is_close(kwargs):
     for one, other in zip(*values, strict=True):
         assert other.dtype == th.float32 and not th.equal(one, other)
     for one, other in list(zip(*values, strict=True))[:3]:
-        assert th.norm(other - one) <= 0.02 * th.norm(one)
+        assert th.norm(other - one) <= 0.05 * th.norm(one)
 
 
 def test_bfloat16_where_the_processor_lacks_it(small, algorithm, monkeypatch):
