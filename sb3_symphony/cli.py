@@ -142,7 +142,7 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
     add("--load-best", action="store_true", help="model with the best evaluation instead of the last one")
     add("--load-checkpoint", type=_whole_number, metavar="N", help="model saved after N steps")
     add("--load-last-checkpoint", action="store_true", help="model saved latest, of a run that did not end")
-    add("--vecnormalize", metavar="PKL", help="statistics of VecNormalize (default: the run's)")
+    add("--vecnormalize", metavar="PKL", help="statistics of VecNormalize, or none (default: the run's)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
     add("--gym-packages", nargs="+", metavar="M", help="modules to import, which register environments")
     add("--device", help="auto, cpu or cuda (default: auto)")

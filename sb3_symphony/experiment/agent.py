@@ -113,7 +113,6 @@ def open_agent(
     render_mode: str | None = None,
     wrappers: Wrappers | None = None,
     norm_reward: bool = False,
-    monitor_folder: Path | None = None,
 ) -> Agent:
     """
     Find and load an agent, and make the environment that it acts in.
@@ -123,7 +122,6 @@ def open_agent(
     :param render_mode: Gymnasium's: ``"human"`` for a window, ``"rgb_array"`` for frames
     :param wrappers: put around the environment, inside ``Monitor``
     :param norm_reward: whether rewards are normalised as in training; reported returns are the environment's own
-    :param monitor_folder: folder for the monitors' CSV files
     :return: the agent
     :raises ConfigError: if something is missing or damaged, or model and environment do not fit
     """
@@ -132,7 +130,7 @@ def open_agent(
     selection = select_model(options)
     if options.num_threads > 0:
         th.set_num_threads(options.num_threads)
-    env = _make_env(selection, n_envs, render_mode, wrappers or [], norm_reward, monitor_folder)
+    env = _make_env(selection, n_envs, render_mode, wrappers or [], norm_reward)
     try:
         model = load_model(selection, options.device)
         env = BaseAlgorithm._wrap_env(env, verbose=0)  # images with their channels first, as in training
@@ -161,19 +159,16 @@ def check_device(name: str) -> None:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _make_env(
-    selection: Selection, n_envs: int, render_mode: str | None, wrappers: Wrappers, norm_reward: bool, folder: Path | None
-) -> VecEnv:
+def _make_env(selection: Selection, n_envs: int, render_mode: str | None, wrappers: Wrappers, norm_reward: bool) -> VecEnv:
     task, _ = split_wrappers(selection.settings.env_wrapper)
     env_kwargs = dict(selection.settings.env_kwargs)
     if render_mode is not None:
         env_kwargs["render_mode"] = render_mode
 
-    def one(index: int) -> gym.Env:
-        env = make_env(selection.env_id, env_kwargs, [*task, *wrappers])
-        return Monitor(env, str(folder / str(index)) if folder else None)
+    def one() -> gym.Env:
+        return Monitor(make_env(selection.env_id, env_kwargs, [*task, *wrappers]))
 
-    env: VecEnv = DummyVecEnv([lambda index=index: one(index) for index in range(n_envs)])  # type: ignore[misc]
+    env: VecEnv = DummyVecEnv([one] * n_envs)
     if selection.normalization is not None:
         env = _load_normalization(selection.normalization, env)
         env.training, env.norm_reward = False, norm_reward and env.norm_reward
@@ -237,7 +232,8 @@ def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None
             broken = archive.testzip()
             if broken:
                 raise zipfile.BadZipFile(f"{broken} is damaged")
-            policy = json.loads(archive.read("data"))["policy_class"]["__module__"]
+            data = json.loads(archive.read("data"))
+            policy = data["policy_class"]["__module__"]
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read — {error.strerror or error}") from None
     except Exception as error:
@@ -250,6 +246,12 @@ def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None
         owners = [name for name in LOADABLE if policy in policies(load_algorithm(name))]
         if owners:  # else a policy of somebody's own
             raise ConfigError(f"{path}: not a model of {selection.algo} — its policy is that of {' or '.join(owners)}")
+    # Kept by SB3 where observations or rewards were normalised
+    if data.get("_last_original_obs") is not None and not selection.normalization_known:
+        raise ConfigError(
+            f"{path}: was trained with VecNormalize — expected its statistics as --vecnormalize FILE, or "
+            "--vecnormalize none if only rewards were normalised"
+        )
 
 
 def _fits(model: spaces.Space, env: spaces.Space, exact: bool) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError, RunSettings, check_algorithm, read_yaml, run_settings, shipped_folder
@@ -31,7 +31,7 @@ class SelectOptions(BaseModel):
     :param load_best: the model with the best evaluation instead of the last one
     :param load_checkpoint: the model after that number of steps
     :param load_last_checkpoint: the latest saved model of a run that did not end
-    :param vecnormalize: statistics of ``VecNormalize`` to use instead of the run's
+    :param vecnormalize: statistics of ``VecNormalize`` to use instead of the run's; ``none``: no normalisation
     :param env_kwargs: arguments of the environment, over those of the run
     :param gym_packages: modules to import, which register environments
     :param device: where the networks run
@@ -66,6 +66,7 @@ class Selection:
     :param settings: settings of that environment: ``env_kwargs``, ``env_wrapper``, ``normalize``, ``frame_stack``
     :param normalization: its statistics of ``VecNormalize``, None without normalisation
     :param run: the run folder that holds it, None for a file from elsewhere
+    :param normalization_known: whether None as ``normalization`` means that there is none, not that nobody told
     """
 
     algo: str
@@ -74,6 +75,7 @@ class Selection:
     settings: RunSettings
     normalization: Path | None
     run: Path | None
+    normalization_known: bool = True
 
 
 def pretrained_folder() -> Path:
@@ -154,11 +156,14 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
         env_kwargs = {}  # of another environment
     settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": {**env_kwargs, **options.env_kwargs}})
     normalization = _normalization(options, model, run, settings)
-    return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None)
+    known = run is not None or options.vecnormalize is not None
+    return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None, known)
 
 
 def _normalization(options: SelectOptions, model: Path, run: RunFolder | None, settings: RunSettings) -> Path | None:
     """Statistics that belong to the model; RL Zoo has only one file for all models of a run."""
+    if options.vecnormalize == "none":
+        return None
     if options.vecnormalize is not None:
         path = Path(options.vecnormalize)
         if not path.is_file():
@@ -238,3 +243,41 @@ def _model_of(run: RunFolder, options: SelectOptions) -> Path:
     if not run.model.is_file():
         raise ConfigError(f"{run.model}: missing, the run has not ended — see --load-best and --load-last-checkpoint")
     return run.model
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Options of the commands
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+class EvaluateOptions(SelectOptions):
+    """Options of ``sb3-symphony evaluate``; their meaning is in its ``--help``."""
+
+    n_episodes: int = Field(default=100, ge=1)
+    seed: int = Field(default=20_000, ge=0, lt=2**31)
+    deterministic: bool = True
+    n_envs: int = Field(default=1, ge=1)
+    obs_noise: FiniteFloat = Field(default=0.0, ge=0)
+    action_delay: int = Field(default=0, ge=0)
+    json_file: str | None = None  # "-": none, whoever asks prints it
+    progress: bool = False
+    num_threads: int = 1  # one observation at a time is fastest so, and results do not depend on the machine's cores
+
+
+class EnjoyOptions(SelectOptions):
+    """Options of ``sb3-symphony enjoy``; their meaning is in its ``--help``."""
+
+    n_timesteps: int = Field(default=1000, ge=1)
+    n_envs: int = Field(default=1, ge=1)
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    deterministic: bool = True
+    render: bool = True
+    norm_reward: bool = False
+    reward_log: str | None = None
+    progress: bool = False
+
+
+class ExportOptions(SelectOptions):
+    """Options of ``sb3-symphony export``; their meaning is in its ``--help``."""
+
+    output: str | None = None
