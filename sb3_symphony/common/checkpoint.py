@@ -24,6 +24,7 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -106,7 +107,10 @@ def _checked_content(path: Path, expected: str | None = None) -> memoryview:
 
 def _unseal(path: Path, expected: str | None = None) -> Any:
     sealed = _checked_content(path, expected)
-    return th.load(io.BytesIO(sealed), map_location="cpu", weights_only=False)
+    try:
+        return th.load(io.BytesIO(sealed), map_location="cpu", weights_only=False)
+    except Exception as error:  # whole, but written by other versions: whatever unpickling raises
+        raise DamagedCheckpoint(f"{path.name}: cannot be read here — {error}") from error
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -544,7 +548,11 @@ class Checkpoint:
     damaged: list[str]
 
 
-def _files(folder: Path) -> dict[int, Path]:
+def checkpoint_files(folder: Path) -> dict[int, Path]:
+    """
+    :param folder: folder of checkpoints
+    :return: environment steps and files of its checkpoints, damaged ones included
+    """
     found = ((re.fullmatch(r"checkpoint_(\d+)\.ckpt", path.name), path) for path in folder.glob("checkpoint_*.ckpt"))
     return {int(match[1]): path for match, path in found if match}
 
@@ -558,7 +566,7 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     :raises DamagedCheckpoint: if there are checkpoints, but none is whole
     """
     damaged: list[str] = []
-    for steps, path in sorted(_files(folder).items(), reverse=True):
+    for steps, path in sorted(checkpoint_files(folder).items(), reverse=True):
         try:
             state = _unseal(path)
             for segment in state["segments"]:
@@ -607,8 +615,9 @@ class ExactCheckpoints(BaseCallback):
         self.files = files
         self.wanted = wanted
         self.report = report
-        self.complete = False  # whether everything that was experienced is stored
-        self.last_saved = 0 if checkpoint is None else checkpoint.steps
+        self.finished = False  # whether learn() came to its end, with everything learned that was experienced
+        self._rollout_ended = False
+        self._latest = 0 if checkpoint is None else checkpoint.steps
         self.segments = ReplaySegments(folder, [] if checkpoint is None else checkpoint.state["segments"])
         self._segments_of: dict[int, set[str]] = {}  # steps of a checkpoint -> files that it needs
         self._restoring = checkpoint
@@ -622,12 +631,15 @@ class ExactCheckpoints(BaseCallback):
         if self._restoring is not None:
             self._restore(self._restoring)
             self._restoring = None
-        elif self.model.num_timesteps // self.save_freq > self.last_saved // self.save_freq or self.wanted():
+        elif self.wanted() or self.model.num_timesteps // self.save_freq > self._latest // self.save_freq:
             self.save()
-        self.complete = False
+        self._rollout_ended = False
 
     def _on_rollout_end(self) -> None:
-        self.complete = True
+        self._rollout_ended = True
+
+    def _on_training_end(self) -> None:
+        self.finished = self._rollout_ended
 
     def _on_step(self) -> bool:
         return True
@@ -644,11 +656,13 @@ class ExactCheckpoints(BaseCallback):
         :return: whether it was written
         """
         model, steps = self.model, self.model.num_timesteps
+        self._latest = steps  # also if it fails: not to be tried again at once
         assert model.env is not None
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             state = training_state(model)
             state["rollout follows"] = rollout_follows
+            state["log folder"] = model.logger.get_dir()
             state["callbacks"] = {type(callback).__name__: _attributes(callback) for callback in self.callbacks}
             state["files"] = {path.name: path.read_bytes() for path in self.files()}
             state["episodes"] = [copy.state() for copy in _recorded(model.env)]
@@ -660,14 +674,13 @@ class ExactCheckpoints(BaseCallback):
         except OSError as error:
             self.report(f"no checkpoint at {steps} steps: {error.strerror} — training goes on, older ones are unharmed")
             return False
-        self.last_saved = steps
         self._segments_of[steps] = {segment.file for segment in state["segments"]}
         self._tidy(steps)
         return True
 
     def _tidy(self, newest: int) -> None:
         """Delete checkpoints beyond ``keep``, those of a future that was given up, and what belongs to none."""
-        files = _files(self.folder)
+        files = checkpoint_files(self.folder)
         kept = sorted(steps for steps in files if steps <= newest)[-self.keep :]
         for steps in kept:
             if steps not in self._segments_of:  # from before a resume
@@ -679,7 +692,8 @@ class ExactCheckpoints(BaseCallback):
         unneeded = [files[steps] for steps in files.keys() - set(kept)]
         unneeded += [path for path in self.folder.glob("replay_*.segment") if path.name not in needed]
         for path in [*unneeded, *self.folder.glob(".*.tmp")]:
-            path.unlink(missing_ok=True)
+            with suppress(OSError):  # to be tried again next time
+                path.unlink()
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         model, state = self.model, checkpoint.state

@@ -28,15 +28,15 @@ class StopOnSignal(BaseCallback):
 
     Stopping between two steps leaves model, replay and files whole. A second signal does not wait.
 
-    :param at_rollouts: stop where the next rollout has begun (a checkpoint can be made there, in
-        ``_on_rollout_start``), not already after the current step
+    :param at_rollouts: stop at the start of the next rollout, not already after the current step: a checkpoint can be
+        made there. It is made by a callback that comes before this one and asks :meth:`here`
     """
 
     def __init__(self, at_rollouts: bool = False) -> None:
         super().__init__()
         self.at_rollouts = at_rollouts
         self.requested = False
-        self.now = False  # whether to stop after the current step
+        self.now = False
 
     def _handle(self, signum: int, frame: Any) -> None:
         if self.requested:
@@ -59,8 +59,14 @@ class StopOnSignal(BaseCallback):
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def _on_rollout_start(self) -> None:
+    def here(self) -> bool:
+        """:return: at the start of a rollout, whether training is going to stop there"""
         self.now = self.requested
+        return self.now
+
+    def _on_rollout_start(self) -> None:
+        if self.now:
+            raise KeyboardInterrupt
 
     def _on_step(self) -> bool:
         return not self.now

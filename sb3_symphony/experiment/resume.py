@@ -1,11 +1,18 @@
 """A run that was stopped, killed or finished, and how it goes on."""
 
 import json
+import sys
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from sb3_symphony.common.checkpoint import Checkpoint, DamagedCheckpoint, newest_checkpoint, write_atomically
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from torch.utils.tensorboard import SummaryWriter
+
+from sb3_symphony.common.checkpoint import Checkpoint, DamagedCheckpoint, checkpoint_files, newest_checkpoint, write_atomically
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
 from sb3_symphony.experiment.run_folder import RunFolder
 
@@ -21,7 +28,7 @@ class StoredRun:
     :param run: its folder
     :param options: options to go on with
     :param config: configuration to go on with
-    :param steps: environment steps of the model at its end, 0 if there is none
+    :param steps: environment steps of its saved model, 0 if there is none
     """
 
     run: RunFolder
@@ -31,8 +38,11 @@ class StoredRun:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to do."""
-        return self.steps >= self.config.settings.n_timesteps
+        """Whether nothing is left to do: model and, if there are any, last checkpoint have all steps."""
+        steps = self.steps
+        if self.run.checkpoints.is_dir():  # a model may also be that of an interrupted run
+            steps = min(steps, max(checkpoint_files(self.run.checkpoints), default=0))
+        return steps >= self.config.settings.n_timesteps
 
     def checkpoint(self) -> Checkpoint | None:
         """
@@ -121,3 +131,36 @@ def restore_files(run: RunFolder, checkpoint: Checkpoint | None) -> None:
             path.unlink()
     for name, content in contents.items():
         write_atomically(run.path / name, content)
+
+
+class _TensorBoardOnward(TensorBoardOutputFormat):
+    """Goes on in a folder; what a killed process logged after the checkpoint is marked as void."""
+
+    def __init__(self, folder: str, steps: int) -> None:
+        self.writer = SummaryWriter(log_dir=folder, purge_step=steps + 1)
+        self._is_closed = False
+
+
+def continue_logs(model: BaseAlgorithm, checkpoint: Checkpoint, learn_arguments: dict[str, Any]) -> None:
+    """
+    Let a resumed model log as if it had never stopped.
+
+    :param model: model that is about to learn
+    :param checkpoint: where it goes on from
+    :param learn_arguments: arguments of its ``learn()``, of which ``log_interval`` may change
+    """
+    if model.tensorboard_log:
+        folder = checkpoint.state["log folder"]
+        writers: list[KVWriter] = [HumanOutputFormat(sys.stdout)] if model.verbose >= 1 else []
+        model.set_logger(Logger(folder, [*writers, _TensorBoardOnward(folder, checkpoint.steps)]))
+    if isinstance(model, OnPolicyAlgorithm) and learn_arguments.get("log_interval", 1) is not None:
+        # Its learn() counts iterations from 0, and logs the count: let it always ask, and answer by the right count
+        algorithm, before = type(model), checkpoint.steps // (model.n_steps * model.n_envs)
+        log_interval = learn_arguments.get("log_interval", 1)
+        learn_arguments["log_interval"] = 1
+
+        def dump_logs(self: OnPolicyAlgorithm, iteration: int = 0) -> None:
+            if (before + iteration) % log_interval == 0:
+                algorithm.dump_logs(self, before + iteration)
+
+        model.__class__ = type(algorithm.__name__, (algorithm,), {"dump_logs": dump_logs})

@@ -28,7 +28,7 @@ from sb3_symphony.experiment.environment import (
     make_training_env,
 )
 from sb3_symphony.experiment.registry import load_algorithm
-from sb3_symphony.experiment.resume import open_run, restore_files
+from sb3_symphony.experiment.resume import continue_logs, open_run, restore_files
 from sb3_symphony.experiment.run_folder import RunFolder
 
 
@@ -155,13 +155,13 @@ def _resuming(checkpoint: Checkpoint | None, model: BaseAlgorithm) -> str:
 def _callbacks(
     options: TrainOptions, config: RunConfig, run: RunFolder, evaluation_env: VecEnv | None, verbose: int
 ) -> tuple[StopOnSignal, SeededEvaluation | None, list[BaseCallback]]:
-    """Those that have a part in the run's results, and what the list ends with, in the order they are called."""
+    """One that stops, one that evaluates if there is an environment for it, and all whose counts belong to the run."""
     stop = StopOnSignal(at_rollouts=options.save_freq > 0)
     evaluation = None if evaluation_env is None else _evaluation(options, config, run, evaluation_env, stop, verbose)
-    callbacks: list[BaseCallback] = [stop, *([evaluation] if evaluation else [])]
+    counting: list[BaseCallback] = [evaluation] if evaluation else []
     if options.save_freq > 0:
-        callbacks.append(_saved_models(options, config, run))
-    return stop, evaluation, callbacks
+        counting.append(_saved_models(options, config, run))
+    return stop, evaluation, counting
 
 
 def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
@@ -240,27 +240,25 @@ def _train(
     checkpoints = None
     if options.save_freq > 0:
         record_episodes(env)
+        files = run.growing_files
         checkpoints = ExactCheckpoints(
-            run.checkpoints,
-            options.save_freq,
-            options.keep,
-            callbacks=tuple(callbacks),
-            files=run.growing_files,
-            checkpoint=checkpoint,
-            wanted=lambda: stop.requested,
+            run.checkpoints, options.save_freq, options.keep, tuple(callbacks), files, checkpoint, wanted=stop.here
         )
         callbacks.append(checkpoints)
+    callbacks.append(stop)  # the checkpoint is made before
     if options.progress:
         bar = ReturnProgressBar(evaluation)
         callbacks.append(bar)
         cleanup.callback(bar.close)
+    learn_arguments: dict[str, Any] = {}
+    if options.log_interval != -1:
+        learn_arguments["log_interval"] = None if options.log_interval == -2 else options.log_interval
+    if checkpoint is not None:
+        continue_logs(model, checkpoint, learn_arguments)
 
     total = config.settings.n_timesteps
     print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
     with stop.listening():
-        learn_arguments: dict[str, Any] = {}
-        if options.log_interval != -1:
-            learn_arguments["log_interval"] = None if options.log_interval == -2 else options.log_interval
         try:
             model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:
@@ -268,11 +266,11 @@ def _train(
         seconds = (time.time_ns() - model.start_time) / 1e9
         if options.progress:
             bar.close()
-        complete = checkpoints is not None and checkpoints.complete
+        finished = checkpoints is not None and checkpoints.finished
         if checkpoints is None or checkpoints.restored:
             _save_model(model, run)
-        if checkpoints is not None and complete:
+        if checkpoints is not None and finished:
             checkpoints.save(rollout_follows=False)
     results = evaluation.evaluations_results if evaluation is not None else []
     last = [float(value) for value in results[-1]] if results else []
-    return TrainResult(run, model.num_timesteps, last, seconds, stop.requested and not complete)
+    return TrainResult(run, model.num_timesteps, last, seconds, stop.requested and not finished)
