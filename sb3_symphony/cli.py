@@ -16,6 +16,7 @@ from sb3_symphony.experiment.config import (
     shipped_environments,
     validated,
 )
+from sb3_symphony.experiment.plot import PlotOptions
 from sb3_symphony.experiment.registry import ALGORITHMS
 from sb3_symphony.experiment.select import EnjoyOptions, EvaluateOptions, ExportOptions, SelectOptions
 
@@ -40,6 +41,13 @@ _ENJOY_EXAMPLES = """examples:
 _EXPORT_EXAMPLES = """examples:
   sb3-symphony export --algo sac --env Pendulum-v1 --load-best
   sb3-symphony export --model ppo.zip --algo ppo --env Hopper-v5 --vecnormalize stats.pkl -o robot.onnx
+"""
+_PLOT_EXAMPLES = """examples:
+  sb3-symphony plot                                        all runs in logs, a panel for each environment
+  sb3-symphony plot -a symphony sac -e BipedalWalker-v3 -o walker.svg
+  sb3-symphony plot -a symphony -e BipedalWalker-v3 -x episodes --mean-per 10
+  sb3-symphony plot logs/sac/Pendulum-v1_1 logs/sac/Pendulum-v1_2 --evaluations -x time
+  sb3-symphony plot -a ppo --scalars
 """
 
 
@@ -252,6 +260,43 @@ def _export(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     return 0
 
 
+def _add_plot(commands: Any) -> None:
+    parser = commands.add_parser(
+        "plot",
+        help="draw learning curves and logged quantities",
+        usage="%(prog)s [RUN ...] [-a ALGO ...] [-e ID ...] [options]",
+        description="Draw runs; those that differ in seed only are one curve: interquartile mean and its 95 % interval.",
+        epilog=_PLOT_EXAMPLES,
+    )
+    add = partial(parser.add_argument, default=argparse.SUPPRESS)
+    add("runs", nargs="*", metavar="RUN", help="run folders, or folders of TensorBoard logs (default: looked for by -a, -e)")
+    add("-a", "--algo", nargs="+", metavar="ALGO", help="algorithms (default: all)")
+    add("-e", "--env", nargs="+", metavar="ID", help="environments (default: all)")
+    add("-f", "--folder", metavar="DIR", help="where runs are kept (default: logs)")
+    add("--evaluations", action="store_true", help="evaluations instead of training episodes")
+    add("--scalars", action="store_true", help="quantities logged for TensorBoard, as small multiples")
+    add("--tags", nargs="+", metavar="TAG", help="only these quantities, e.g. train/approx_kl train/clip_fraction")
+    add("-x", "--x-axis", choices=("steps", "episodes", "time"), help="(default: steps)")
+    add("-y", "--y-axis", choices=("reward", "length", "success"), help="(default: reward)")
+    add("-w", "--episode-window", type=_whole_number, metavar="N", help="running mean of N episodes (default: 100)")
+    add("--mean-per", type=_whole_number, metavar="N", help="instead of it, one point for every N episodes: their mean")
+    add("-max", "--max-timesteps", type=_whole_number, metavar="N", help="leave out what came after N environment steps")
+    add("-l", "--labels", nargs="+", metavar="LABEL", help="names of the curves, in their order")
+    add("-o", "--output", metavar="FILE", help=".png, .svg or .pdf (default: in the run's folder, or beside the runs)")
+    add("--json", dest="json_file", metavar="FILE", help="write the numbers of the curves as JSON; -: print them so")
+    parser.set_defaults(run=_plot, parser=parser)
+
+
+def _plot(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    from sb3_symphony.experiment.plot import plot
+
+    options = validated(PlotOptions, arguments)
+    output = plot(options)
+    if options.json_file != "-":
+        print(output)
+    return 0
+
+
 def _add_list(commands: Any) -> None:
     parser = commands.add_parser(
         "list",
@@ -285,6 +330,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_enjoy(commands)
     _add_evaluate(commands)
     _add_export(commands)
+    _add_plot(commands)
     _add_list(commands)
     return parser
 

@@ -1,49 +1,302 @@
-"""The curve of a run."""
+"""Figures: what is drawn equals what the files say."""
+
+import json
 
 import numpy as np
+import pytest
 import yaml
 from matplotlib import image
+from matplotlib.colors import to_hex
+from torch.utils.tensorboard import SummaryWriter
 
-from sb3_symphony.analysis.plots import plot_training, read_monitors, running_mean
-
-
-def write_monitor(path, start, rows):
-    lines = [f'#{{"t_start": {start}, "env_id": "X"}}', "r,l,t", *(f"{r},{n},{t}" for r, n, t in rows)]
-    path.write_text("\n".join(lines) + "\n")
-
-
-def test_parallel_environments_are_merged_by_time(tmp_path):
-    write_monitor(tmp_path / "0.monitor.csv", 100.0, [(1.0, 10, 1.0), (3.0, 20, 5.0)])
-    write_monitor(tmp_path / "1.monitor.csv", 101.0, [(2.0, 15, 1.5)])
-    steps, returns = read_monitors(tmp_path)
-    np.testing.assert_array_equal(steps, [10, 25, 45])
-    np.testing.assert_array_equal(returns, [1.0, 2.0, 3.0])
+from sb3_symphony.analysis import plots
+from sb3_symphony.analysis.plots import block_mean, plot_training, running_mean, summarised
+from sb3_symphony.analysis.statistics import bootstrap_interval, iqm
+from sb3_symphony.analysis.style import COLORS, save, spread
+from sb3_symphony.cli import main
 
 
-def test_a_torn_last_line_is_left_out(tmp_path):
-    write_monitor(tmp_path / "0.monitor.csv", 0.0, [(1.0, 10, 1.0)])
-    with (tmp_path / "0.monitor.csv").open("a") as file:
-        file.write("-12.3,")
-    assert len(read_monitors(tmp_path)[0]) == 1
+def make_run(folder, algo, env, number, returns, seconds_per_episode=60.0, length=100, log=False):
+    """A run whose episodes have the given returns, with an evaluation every 200 steps."""
+    path = folder / algo / f"{env}_{number}"
+    (path / env).mkdir(parents=True)
+    rows = [f"{value},{length},{seconds_per_episode * (k + 1)}" for k, value in enumerate(returns)]
+    (path / "0.monitor.csv").write_text("\n".join(['#{"t_start": 5.0}', "r,l,t", *rows]) + "\n")
+    steps = np.arange(200, len(returns) * length + 1, 200)
+    results = np.asarray(returns)[steps // length - 1][:, None] + np.array([-1.0, 0.0, 4.0])
+    np.savez(path / "evaluations.npz", timesteps=steps, results=results, ep_lengths=np.full(results.shape, 7))
+    (path / env / "args.yml").write_text(yaml.safe_dump({"algo": algo, "env": env, "seed": number}))
+    (path / env / "config.yml").write_text(yaml.safe_dump({"n_timesteps": 1000}))
+    if log:
+        with SummaryWriter(folder / "tb" / f"{algo}_{number}") as writer:
+            for k, value in enumerate(returns):
+                writer.add_scalar("train/critic_loss", value**2, 100 * k)
+                writer.add_scalar("train/own", value, 100 * k)
+        (path / env / "tensorboard.txt").write_text(str(folder / "tb" / f"{algo}_{number}"))
+    return path
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """Figures that were saved."""
+    saved = []
+    monkeypatch.setattr(plots, "save", lambda figure, output: saved.append(figure) or save(figure, output))
+    return saved
+
+
+@pytest.fixture
+def logs(tmp_path, monkeypatch):
+    """Three seeds of sac, one of td3 on X, one of sac on Y."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "logs"
+    rng = np.random.default_rng(0)
+    for number in (1, 2, 3):
+        make_run(folder, "sac", "X-v0", number, rng.normal(size=20) + np.arange(20), log=True)
+    make_run(folder, "td3", "X-v0", 1, np.arange(30.0))
+    make_run(folder, "sac", "Y-v0", 1, np.arange(10.0))
+    return folder
+
+
+def lines(axes):
+    """Bold and faint lines of a panel, as (x, y)."""
+    bold = [line.get_xydata().T for line in axes.lines if line.get_linewidth() > 1]
+    faint = [line.get_xydata().T for line in axes.lines if line.get_linewidth() <= 1]
+    return bold, faint
+
+
+def returns_of(folder, number, algo="sac"):
+    return np.loadtxt(folder / algo / f"X-v0_{number}" / "0.monitor.csv", delimiter=",", skiprows=2)[:, 0]
+
+
+def texts(axes):
+    return [text.get_text() for text in axes.texts]
+
+
+# ---------------------------------------------------------------- numbers
 
 
 def test_running_mean():
     np.testing.assert_allclose(running_mean(np.array([1.0, 2.0, 3.0, 4.0]), 2), [1.0, 1.5, 2.5, 3.5])
 
 
-def test_figure(tmp_path):
-    write_monitor(tmp_path / "0.monitor.csv", 0.0, [(float(k), 100, float(k)) for k in range(30)])
-    np.savez(tmp_path / "evaluations.npz", timesteps=[1000, 2000], results=[[1.0, 2.0], [3.0, 4.0]], ep_lengths=[[1, 1]] * 2)
-    (tmp_path / "X").mkdir()
-    (tmp_path / "X" / "args.yml").write_text(yaml.safe_dump({"algo": "sac", "env": "X", "seed": 3}))
-    path = plot_training(tmp_path)
-    assert path == tmp_path / "training.png"
-    pixels = image.imread(path)
-    assert pixels.shape[1] >= 1000  # sharp in print
-    assert pixels[..., :3].std() > 0.05  # something is drawn
-    assert plot_training(tmp_path, tmp_path / "curve.pdf").read_bytes().startswith(b"%PDF")
+def test_block_mean():
+    np.testing.assert_allclose(block_mean(np.arange(8.0), 3), [1.0, 4.0])
 
 
-def test_a_run_without_episodes_has_a_figure_too(tmp_path):
-    write_monitor(tmp_path / "0.monitor.csv", 0.0, [])
+def test_seeds_at_the_same_points():
+    seeds = [(np.array([10, 20, 30]), np.array(y)) for y in ([1.0, 5, 9], [3.0, 5, 7], [2.0, 8, 0], [0.0, 0, 1])]
+    seeds.append((np.array([10, 20]), np.array([7.0, 2.0])))  # a shorter run is not left out
+    curve = summarised("a", seeds)
+    values = np.array([y[:2] for _, y in seeds])
+    np.testing.assert_array_equal(curve.x, [10, 20])
+    np.testing.assert_allclose(curve.y, iqm(values, axis=0))
+    np.testing.assert_allclose([curve.low, curve.high], bootstrap_interval([values], repetitions=2000))
+
+
+def test_seeds_at_different_points_are_interpolated():
+    curve = summarised(
+        "a", [(np.array([0, 100]), np.array([0.0, 100.0])), (np.array([50, 80, 150]), np.array([50.0, 80.0, 150.0]))]
+    )
+    assert (curve.x[0], curve.x[-1]) == (50, 100)
+    np.testing.assert_allclose(curve.y, curve.x)
+    apart = summarised("a", [(np.array([0, 1]), np.zeros(2)), (np.array([5, 6]), np.zeros(2))])
+    assert len(apart.x) == 0 and len(apart.seeds) == 2
+
+
+def test_names_do_not_overlap():
+    rng = np.random.default_rng(0)
+    np.testing.assert_array_equal(spread([0.9, 0.1, 0.5], 0.2), [0.9, 0.1, 0.5])  # nothing to do
+    np.testing.assert_allclose(spread([0.5, 0.5], 0.2), [0.4, 0.6])
+    for _ in range(50):
+        wished = rng.random(6)
+        placed = spread(wished, 0.1)
+        assert (np.diff(np.sort(placed)) > 0.1 - 1e-9).all()
+        np.testing.assert_array_equal(np.argsort(placed), np.argsort(wished))
+        assert placed.mean() == pytest.approx(wished.mean())
+
+
+# ---------------------------------------------------------------- figures
+
+
+def test_training_curves(logs, figures, capsys):
+    assert main(["plot", "-a", "sac", "td3", "-e", "X-v0", "-w", "5"]) == 0
+    assert capsys.readouterr().out.strip() == "logs/X-v0_training.png"
+    (axes,) = figures[0].axes
+    bold, faint = lines(axes)
+    seeds = np.array([running_mean(returns_of(logs, number), 5) for number in (1, 2, 3)])
+    np.testing.assert_array_equal(bold[0][0], np.arange(100, 2001, 100))
+    np.testing.assert_allclose(bold[0][1], iqm(seeds, axis=0))
+    np.testing.assert_allclose([y for _, y in faint], seeds)
+    np.testing.assert_allclose(bold[1][1], running_mean(np.arange(30.0), 5))
+    (band,) = axes.collections
+    low, high = bootstrap_interval([seeds], repetitions=2000)
+    vertices = band.get_paths()[0].vertices
+    for x, bottom, top in zip(bold[0][0], low, high, strict=True):
+        heights = vertices[vertices[:, 0] == x][:, 1]
+        assert heights.min() == pytest.approx(bottom) and heights.max() == pytest.approx(top)
+    assert texts(axes) == ["sac, 3 seeds", "td3"]
+    assert [to_hex(text.get_color()).upper() for text in axes.texts] == list(COLORS[:2])
+    assert axes.get_xlabel() == "environment steps" and axes.get_ylabel() == "return per episode"
+    assert "running mean of 5 episodes" in figures[0].get_supxlabel()
+
+
+def test_a_panel_for_each_environment(logs, figures):
+    assert main(["plot", "-l", "SAC", "TD3", "-o", "all.svg"]) == 0
+    assert [axes.get_title("left") for axes in figures[0].axes] == ["X-v0", "Y-v0"]
+    assert texts(figures[0].axes[1]) == ["SAC"]  # in the colour it has in the other panel
+    assert to_hex(figures[0].axes[1].texts[0].get_color()).upper() == COLORS[0]
+    assert b"<svg" in (logs.parent / "all.svg").read_bytes()[:1000]
+
+
+def test_mean_per_ten_episodes(logs, figures):
+    assert main(["plot", "logs/td3/X-v0_1", "-x", "episodes", "--mean-per", "10"]) == 0
+    (bold,), faint = lines(figures[0].axes[0])
+    np.testing.assert_allclose(bold, [[10, 20, 30], [4.5, 14.5, 24.5]])
+    assert not faint and figures[0].axes[0].get_xlabel() == "training episodes"
+    assert (logs / "td3" / "X-v0_1" / "training.png").exists()
+
+
+@pytest.mark.parametrize("seconds, unit, last", [(0.1, "seconds", "3"), (20.0, "minutes", "10"), (3600.0, "hours", "30")])
+def test_wall_clock(tmp_path, figures, seconds, unit, last):
+    run = make_run(tmp_path, "sac", "X-v0", 1, np.arange(30.0), seconds_per_episode=seconds)
+    assert main(["plot", str(run), "-x", "time"]) == 0
+    (bold,), _ = lines(figures[0].axes[0])
+    np.testing.assert_allclose(bold[0], seconds * np.arange(1, 31))
+    axes = figures[0].axes[0]
+    assert axes.get_xlabel() == f"wall-clock time ({unit})"
+    assert axes.get_xticklabels()[-1].get_text() == last
+
+
+def test_episode_lengths_and_cut(logs, figures):
+    assert main(["plot", "logs/sac/Y-v0_1", "-y", "length", "-max", "500"]) == 0
+    (bold,), _ = lines(figures[0].axes[0])
+    np.testing.assert_allclose(bold, [[100, 200, 300, 400, 500], [100] * 5])
+    assert figures[0].axes[0].get_ylabel() == "episode length (steps)"
+
+
+@pytest.mark.parametrize("axis, scale", [("steps", 1.0), ("episodes", 0.01), ("time", 0.6)])
+def test_evaluations(logs, figures, axis, scale):
+    assert main(["plot", "-a", "sac", "-e", "X-v0", "--evaluations", "-x", axis]) == 0
+    (bold,), faint = lines(figures[0].axes[0])
+    seeds = np.array([returns_of(logs, number)[1::2] + 1.0 for number in (1, 2, 3)])
+    np.testing.assert_allclose(bold[0], np.arange(200, 2001, 200) * scale)
+    np.testing.assert_allclose(bold[1], iqm(seeds, axis=0))
+    np.testing.assert_allclose([y for _, y in faint], seeds)
+
+
+def test_scalars(logs, figures, capsys):
+    assert main(["plot", "-e", "X-v0", "--scalars", "-o", "s.png"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and "left out: logs/td3/X-v0_1: no TensorBoard log is known" in captured.err
+    (axes,) = figures[0].axes
+    (bold,), faint = lines(axes)
+    seeds = np.array([returns_of(logs, number) ** 2 for number in (1, 2, 3)])
+    np.testing.assert_allclose(bold[1], iqm(seeds, axis=0), rtol=1e-5)
+    np.testing.assert_allclose([y for _, y in faint], seeds, rtol=1e-5)
+    assert (axes.get_title("left"), axes.get_ylabel()) == ("critic loss", "loss")
+    assert main(["plot", "logs/tb/sac_1", "--tags", "train/own", "train/critic_loss", "-o", "s.png"]) == 0
+    assert [axes.get_title("left") for axes in figures[1].axes] == ["train/own", "critic loss"]
+    np.testing.assert_allclose(lines(figures[1].axes[0])[0][0][1], returns_of(logs, 1), rtol=1e-6)
+
+
+def test_numbers_as_json(logs):
+    assert main(["plot", "-e", "X-v0", "-w", "1", "--json", "curves.json"]) == 0
+    content = json.loads((logs.parent / "curves.json").read_text())
+    sac, td3 = content["panels"]["X-v0"]
+    assert (content["x"], sac["label"], td3["y"]) == ("steps", "sac", list(range(30)))
+    np.testing.assert_allclose(sac["seeds"][1]["y"], returns_of(logs, 2))
+
+
+def test_images(logs):
+    for name, start in (("a.png", b"\x89PNG"), ("b.pdf", b"%PDF"), ("sub/c.svg", b"<?xml")):
+        assert main(["plot", "-o", name]) == 0
+        first = (logs.parent / name).read_bytes()
+        assert first.startswith(start)
+        assert main(["plot", "-o", name]) == 0
+        assert (logs.parent / name).read_bytes() == first  # drawn again, the same file
+    pixels = image.imread(logs.parent / "a.png")
+    assert pixels.shape[1] >= 1400 and pixels[..., :3].std() > 0.05
+
+
+def test_nothing_is_cut_off(logs, figures):
+    assert main(["plot", "-l", "a rather long name of a curve", "another name", "-e", "X-v0"]) == 0
+    figure = figures[0]
+    figure.draw_without_rendering()
+    width, height = figure.get_size_inches() * figure.dpi
+    for axes in figure.axes:
+        for text in axes.texts:
+            box = text.get_window_extent()
+            assert box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height
+
+
+# ---------------------------------------------------------------- the figure of a run
+
+
+def test_plot_training(tmp_path, figures):
+    run = make_run(tmp_path, "sac", "X-v0", 3, np.arange(30.0))
+    assert plot_training(run) == run / "training.png"
+    (axes,) = figures[0].axes
+    assert axes.get_title("left") == "sac on X-v0, seed 3"
+    dots, mean, evaluation = (line.get_xydata().T for line in axes.lines[:3])
+    np.testing.assert_allclose(dots, [np.arange(100, 3001, 100), np.arange(30)])
+    np.testing.assert_allclose(mean[1], running_mean(np.arange(30.0), 20))
+    np.testing.assert_allclose(evaluation, [np.arange(200, 3001, 200), np.arange(1.0, 30, 2) + 1])
+    assert texts(axes) == ["training,\nmean of 20", "evaluation"]
+    assert plot_training(run, tmp_path / "curve.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_run_without_episodes_has_a_figure_too(tmp_path, figures):
+    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 5.0}\nr,l,t\n')
     assert plot_training(tmp_path).exists()
+    assert texts(figures[0].axes[0]) == ["no finished episode"]
+
+
+# ---------------------------------------------------------------- mistakes
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ("-a sca", "-a: 'sca' — no such run in logs: did you mean 'sac'?"),
+        ("-e X-v1", "-e: 'X-v1' — no such run in logs: did you mean 'X-v0'?"),
+        ("-f nowhere", "no runs in 'nowhere'"),
+        ("-f nowhere -a sac", "-a: 'sac' — no such run in nowhere"),
+        ("logs/sac", "logs/sac: no run folder and no TensorBoard log"),
+        ("logs/sac/X-v0_9", "logs/sac/X-v0_9: no such folder"),
+        ("logs/sac/X-v0_1 -a sac", "expected run folders, or -a and -e to look for runs, not both"),
+        ("--scalars --evaluations", "expected only one of them"),
+        ("--scalars -y length", "-y: length — is for episodes"),
+        ("--evaluations --mean-per 10", "--mean-per: 10 — is for training episodes"),
+        ("--scalars -a td3", "logs/td3/X-v0_1: no TensorBoard log is known"),
+        ("--tags train/critic_los", "did you mean 'train/critic_loss'?"),
+        ("-l a", "-l: 1 labels — expected 2, for sac, td3"),
+        ("-y success", "does not tell whether an episode is a success"),
+        ("-o picture.bmp", "picture.bmp: expected a name that ends in .png, .svg, .pdf"),
+        ("-o /proc/none/a.png", "cannot be written"),
+        ("-w 0", "episode_window: 0"),
+        ("-x miles", "unknown x_axis 'miles'"),
+        ("--tag x", "did you mean '--tags'?"),
+    ],
+)
+def test_mistakes(logs, capsys, arguments, message):
+    before = sorted(logs.parent.rglob("*"))
+    try:
+        status = main(["plot", *arguments.split()])
+    except SystemExit as error:
+        status = error.code
+    captured = capsys.readouterr()
+    assert status == 2 and captured.err.count("\n") == 1 and message in captured.err
+    assert sorted(logs.parent.rglob("*")) == before
+
+
+def test_a_damaged_file(logs, capsys):
+    (logs / "sac" / "X-v0_2" / "evaluations.npz").write_bytes(b"broken")
+    assert main(["plot", "--evaluations", "-e", "X-v0"]) == 2
+    assert "evaluations.npz: not evaluations of Stable-Baselines3, or damaged" in capsys.readouterr().err
+
+
+def test_a_run_without_evaluations_is_told(logs, capsys, figures):
+    (logs / "sac" / "X-v0_2" / "evaluations.npz").unlink()
+    assert main(["plot", "--evaluations", "-e", "X-v0", "-a", "sac"]) == 0
+    assert "left out: logs/sac/X-v0_2: has no evaluations.npz" in capsys.readouterr().err
+    assert texts(figures[0].axes[0]) == ["sac, 2 seeds"]

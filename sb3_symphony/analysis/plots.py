@@ -1,37 +1,94 @@
-"""Figures from the files of runs; no algorithm is imported."""
+"""
+Learning curves and logged quantities of runs.
 
-import csv
-import json
+A curve is that of a group of runs which differ in their seed: the interquartile mean (IQM) over the seeds, with a 95 %
+bootstrap interval, beside the single seeds. Where seeds were recorded at different steps they are interpolated linearly,
+and the IQM ends where the shortest one ends.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
-import yaml
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.axes import Axes
+from matplotlib.ticker import EngFormatter, PercentFormatter
 
-# Dark blue and orange: apart for colour-blind eyes and in greyscale print
-_TRAINING, _EVALUATION = "#1f4e8c", "#d95f02"
+from sb3_symphony.analysis.runs import NotRecorded, Run, open_run
+from sb3_symphony.analysis.statistics import bootstrap_interval, iqm
+from sb3_symphony.analysis.style import COLORS, house_style, line_style, name_lines, new_figure, note, save
+from sb3_symphony.common.checks import suggestion
+
+XAxis = Literal["steps", "episodes", "time"]
+YAxis = Literal["reward", "length", "success"]
+Line = tuple[np.ndarray, np.ndarray]  # x and y, each (n,)
+
+_X_LABELS = {"steps": "environment steps", "episodes": "training episodes"}
+_Y_LABELS = {"reward": "return per episode", "length": "episode length (steps)", "success": "successful episodes"}
+
+#: logged quantities worth a look, in the order of their panels: what they are and their unit
+SCALARS: dict[str, tuple[str, str]] = {
+    "rollout/ep_rew_mean": ("training return", "return, mean of 100"),
+    "rollout/ep_len_mean": ("training episode length", "steps"),
+    "rollout/success_rate": ("training successes", "share of episodes"),
+    "eval/mean_reward": ("evaluation return", "return, mean"),
+    "eval/mean_ep_length": ("evaluation episode length", "steps"),
+    "time/fps": ("speed", "environment steps / s"),
+    "train/approx_kl": ("approximate KL divergence", "nats"),
+    "train/kl_divergence_loss": ("KL divergence", "nats"),
+    "train/clip_fraction": ("clip fraction", "share of samples"),
+    "train/entropy_loss": ("entropy loss (− entropy)", "nats"),
+    "train/explained_variance": ("explained variance", "share of variance"),
+    "train/policy_gradient_loss": ("policy gradient loss", "loss"),
+    "train/policy_objective": ("policy objective", "objective"),
+    "train/value_loss": ("value loss", "loss"),
+    "train/loss": ("total loss", "loss"),
+    "train/actor_loss": ("actor loss", "loss"),
+    "train/critic_loss": ("critic loss", "loss"),
+    "train/ent_coef": ("entropy coefficient", "reward / nat"),
+    "train/ent_coef_loss": ("entropy coefficient loss", "loss"),
+    "train/std": ("standard deviation of actions", "action units"),
+    "train/noise_std": ("exploration noise", "std, scaled action units"),
+    "train/q_mean": ("mean Q-value", "discounted return"),
+    "train/q_std": ("spread of the critics", "std, discounted return"),
+    "q_bias/normalized_mean": ("Q bias, mean", "share of mean return"),
+    "q_bias/normalized_std": ("Q bias, standard deviation", "share of mean return"),
+    "train/learning_rate": ("learning rate", "step size"),
+    "train/update_ratio": ("update ratio", "updates / step"),
+}
 
 
-def read_monitors(run: Path) -> tuple[np.ndarray, np.ndarray]:
+@dataclass(frozen=True)
+class Curve:
     """
-    Read the training episodes of a run, those of parallel environments merged by the time of their ends.
+    What a figure shows of a group.
 
-    :param run: run folder
-    :return: environment steps at the end of each episode, summed over all environments, and the episodes' returns
+    :param label: name of the group
+    :param seeds: of each run, x and y
+    :param x: shape ``(n,)``; empty if the runs have no common range
+    :param y: IQM over the seeds, shape ``(n,)``; with one seed its own values
+    :param low: lower limit of the 95 % interval, shape ``(n,)``, or empty with one seed
+    :param high: upper limit
     """
-    episodes = []
-    for path in run.glob("*.monitor.csv"):
-        with path.open(encoding="utf-8", newline="") as lines:
-            start = json.loads(lines.readline().removeprefix("#"))["t_start"]
-            for row in csv.DictReader(lines):
-                try:
-                    episodes.append((start + float(row["t"]), int(row["l"]), float(row["r"])))
-                except (TypeError, ValueError):
-                    continue  # a line cut short by a crash
-    episodes.sort()
-    return np.cumsum([length for _, length, _ in episodes], dtype=np.int64), np.array([ret for _, _, ret in episodes])
+
+    label: str
+    seeds: list[Line]
+    x: np.ndarray
+    y: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def plain(self) -> dict[str, Any]:
+        """:return: the numbers, as JSON takes them"""
+        arrays = {name: getattr(self, name).tolist() for name in ("x", "y", "low", "high")}
+        return {"label": self.label, **arrays, "seeds": [{"x": x.tolist(), "y": y.tolist()} for x, y in self.seeds]}
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Numbers
+# ----------------------------------------------------------------------------------------------------------------------
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
@@ -46,49 +103,305 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     return (sums[last] - sums[first]) / (last - first)
 
 
-def _title(run: Path) -> str:
-    """Algorithm, environment and seed, or the folder's name if they are not recorded."""
-    for path in run.glob("*/args.yml"):
-        options = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return f"{options['algo']} on {options['env']}, seed {options['seed']}"
-    return run.name
-
-
-def plot_training(run: Path, output: Path | None = None, window: int = 20) -> Path:
+def block_mean(values: np.ndarray, size: int) -> np.ndarray:
     """
-    Draw the returns of training episodes and evaluations against environment steps.
+    :param values: shape ``(n,)``
+    :param size: number of values in a block
+    :return: mean of every ``size`` values, shape ``(n // size,)``; what is left at the end is no block
+    """
+    return values[: len(values) // size * size].reshape(-1, size).mean(axis=1)
 
-    :param run: run folder
+
+def _common_grid(xs: Sequence[np.ndarray], n_points: int = 300) -> np.ndarray:
+    """Where all seeds are known: the points of the shortest one if the others share them, else even steps."""
+    shortest = min(xs, key=len)
+    if all(np.array_equal(x[: len(shortest)], shortest) for x in xs):
+        return shortest
+    if min(map(len, xs)) == 0 or max(x[0] for x in xs) > min(x[-1] for x in xs):
+        return np.empty(0)
+    return np.linspace(max(x[0] for x in xs), min(x[-1] for x in xs), n_points)
+
+
+def summarised(label: str, seeds: Sequence[Line]) -> Curve:
+    """
+    :param label: name of the group
+    :param seeds: of each run, x (ascending) and y; at least one
+    :return: their curve
+    """
+    seeds = list(seeds)
+    if len(seeds) == 1:
+        return Curve(label, seeds, *seeds[0], np.empty(0), np.empty(0))
+    grid = _common_grid([x for x, _ in seeds])
+    if len(grid) == 0:
+        return Curve(label, seeds, grid, grid, grid, grid)
+    values = np.stack([np.interp(grid, x, y) for x, y in seeds])  # (seeds, points)
+    return Curve(label, seeds, grid, iqm(values, axis=0), *bootstrap_interval([values], repetitions=2000))
+
+
+def _episodes_of(run: Run, need: str) -> Line:
+    if run.episodes is None:
+        raise NotRecorded(f"{run.path}: has no *.monitor.csv — expected one for {need}")
+    return run.episodes.steps, run.episodes.seconds
+
+
+def _located(run: Run, steps: np.ndarray, x: XAxis) -> np.ndarray:
+    """Environment steps as positions on the x axis, by the training episodes that ended around them."""
+    if x == "steps":
+        return steps
+    ends, seconds = _episodes_of(run, f"an axis of {x}")
+    known = np.arange(1, len(ends) + 1) if x == "episodes" else seconds
+    return np.interp(steps, np.concatenate([[0], ends]), np.concatenate([[0], known]))
+
+
+def _not_told(run: Run) -> NotRecorded:
+    return NotRecorded(f"{run.path}: its environment does not tell whether an episode is a success")
+
+
+def episode_curve(run: Run, x: XAxis, y: YAxis, window: int, per: int | None = None, max_steps: int | None = None) -> Line:
+    """
+    Training episodes of a run as a line.
+
+    :param run: the run
+    :param x: axis to draw against
+    :param y: what to draw
+    :param window: number of episodes in the running mean
+    :param per: instead of a running mean, one point for every ``per`` episodes: their mean, at the end of the last one
+    :param max_steps: later environment steps are left out; None: nothing is
+    :return: x and y
+    :raises NotRecorded: if it is not in the files of the run
+    """
+    ends, seconds = _episodes_of(run, "a curve of training episodes")
+    assert run.episodes is not None
+    values = {"reward": run.episodes.returns, "length": run.episodes.lengths, "success": run.episodes.successes}[y]
+    if values is None:
+        raise _not_told(run)
+    n = len(ends) if max_steps is None else int(np.searchsorted(ends, max_steps, side="right"))
+    at, values = {"steps": ends, "episodes": np.arange(1, len(ends) + 1), "time": seconds}[x][:n], values[:n]
+    if per is None:
+        return at, running_mean(values, window)
+    return at[per - 1 :: per], block_mean(values, per)
+
+
+def evaluation_curve(run: Run, x: XAxis, y: YAxis, max_steps: int | None = None) -> Line:
+    """
+    Evaluations of a run as a line.
+
+    :param run: the run
+    :param x: axis to draw against; time and episodes are interpolated between the ends of training episodes
+    :param y: what to draw, the mean over the episodes of each evaluation
+    :param max_steps: later environment steps are left out; None: nothing is
+    :return: x and y
+    :raises NotRecorded: if it is not in the files of the run
+    """
+    data = run.evaluations
+    if data is None:
+        raise NotRecorded(f"{run.path}: has no evaluations.npz — `train --eval-freq` writes it")
+    values = {"reward": data.returns, "length": data.lengths, "success": data.successes}[y]
+    if values is None:
+        raise _not_told(run)
+    kept = data.steps <= (math.inf if max_steps is None else max_steps)
+    return _located(run, data.steps, x)[kept], values.mean(axis=1)[kept]
+
+
+def scalar_curve(run: Run, tag: str, x: XAxis, max_steps: int | None = None) -> Line:
+    """
+    A logged quantity of a run as a line.
+
+    :param run: the run
+    :param tag: name of one of its scalars
+    :param x: axis to draw against
+    :param max_steps: later environment steps are left out; None: nothing is
+    :return: x and y; values that are not finite are left out
+    :raises NotRecorded: if it is not in the files of the run
+    """
+    if tag not in run.scalars:
+        raise NotRecorded(f"{run.path}: has not logged {tag!r}{suggestion(tag, run.scalars)}")
+    scalar = run.scalars[tag]
+    at = scalar.seconds if x == "time" else _located(run, scalar.steps, x)
+    kept = np.isfinite(scalar.values) & (scalar.steps <= (math.inf if max_steps is None else max_steps))
+    return at[kept], scalar.values[kept]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Figures
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _draw(axes: Axes, curve: Curve, index: int) -> None:
+    style = line_style(index)
+    if len(curve.seeds) > 1:
+        for x, y in curve.seeds:
+            axes.plot(x, y, color=style["color"], linewidth=0.7, alpha=0.35)
+        if len(curve.low):
+            axes.fill_between(curve.x, curve.low, curve.high, color=style["color"], alpha=0.15, linewidth=0)
+    marker = "o" if len(curve.x) <= 40 else None
+    axes.plot(curve.x, curve.y, **style, marker=marker, markersize=3, label=curve.label)
+
+
+def _name(curve: Curve) -> str:
+    n = len(curve.seeds)
+    return curve.label if n == 1 else f"{curve.label}, {n} seeds"
+
+
+def _scale_x(axes: Axes, x: XAxis) -> None:
+    """Label, unit and limits of the x axis. Curves hold seconds; the ticks say hours, minutes or seconds."""
+    axes.margins(x=0.01)
+    axes.set_xlim(left=0)
+    if x == "time":
+        right = axes.get_xlim()[1]
+        unit, size = next((u, s) for u, s in (("hours", 3600), ("minutes", 60), ("seconds", 1)) if right >= 2 * s or s == 1)
+        step = next(s for s in _nice_steps() if right / (s * size) <= 8)
+        ticks = np.arange(0, right / size + 1e-9, step)
+        axes.set_xticks(ticks * size, [f"{tick:g}" for tick in ticks])
+        axes.set_xlabel(f"wall-clock time ({unit})")
+    else:
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_xlabel(_X_LABELS[x])
+
+
+def _nice_steps() -> list[float]:
+    return [factor * 10.0**power for power in range(-3, 7) for factor in (1, 2, 5)]
+
+
+def _explained(curves: Sequence[Curve], smoothed: str) -> str:
+    several = any(len(curve.seeds) > 1 for curve in curves)
+    parts = ["bold: interquartile mean over seeds; band: its 95 % bootstrap interval; faint: single seeds"] if several else []
+    return "; ".join([*parts, smoothed] if smoothed else parts)
+
+
+def plot_curves(panels: dict[str, list[Curve]], x: XAxis, y: YAxis, smoothed: str, output: Path) -> Path:
+    """
+    Draw curves, one panel for each environment.
+
+    :param panels: title of each panel → its curves
+    :param x: what their x is; seconds for ``"time"``
+    :param y: what their y is
+    :param smoothed: how the curves were smoothed, for the note under the figure
+    :param output: image file, its kind told by its suffix
+    :return: the image file
+    :raises ValueError: for an unknown kind of image
+    """
+    with house_style():
+        columns = min(len(panels), 2)
+        rows = -(-len(panels) // columns)
+        figure = new_figure(7.0 if columns == 1 else 5.2 * columns, 3.8 * rows if columns == 1 else 3.2 * rows)
+        grid = figure.subplots(rows, columns, squeeze=False)
+        labels = list(dict.fromkeys(curve.label for curves in panels.values() for curve in curves))
+        for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
+            for curve in curves:
+                _draw(axes, curve, labels.index(curve.label))
+            axes.set_title(title)
+            axes.set_ylabel(_Y_LABELS[y])
+            if y == "success":
+                axes.set_ylim(0, 1.02)
+                axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+            _scale_x(axes, x)
+        for axes in grid.flat[len(panels) :]:
+            axes.remove()
+        note(figure, _explained([curve for curves in panels.values() for curve in curves], smoothed))
+        for axes, curves in zip(grid.flat, panels.values(), strict=False):
+            ends = [(_name(c), _end_value(c), line_style(labels.index(c.label))["color"]) for c in curves]
+            name_lines(figure, axes, ends)
+        return save(figure, output)
+
+
+def _end_value(curve: Curve) -> float:
+    values = curve.y if len(curve.y) else max(curve.seeds, key=lambda seed: len(seed[0]))[1]
+    return float(values[-1])
+
+
+def plot_scalars(panels: dict[str, list[Curve]], x: XAxis, output: Path, title: str = "") -> Path:
+    """
+    Draw logged quantities as small multiples.
+
+    :param panels: tag of each quantity, such as ``train/approx_kl`` → its curves
+    :param x: what their x is; seconds for ``"time"``
+    :param output: image file, its kind told by its suffix
+    :param title: of the figure
+    :return: the image file
+    :raises ValueError: for an unknown kind of image
+    """
+    with house_style():
+        columns = min(len(panels), 3)
+        rows = -(-len(panels) // columns)
+        figure = new_figure(3.4 * columns, 2.2 * rows + 0.4)
+        grid = figure.subplots(rows, columns, squeeze=False)
+        every = [curve for curves in panels.values() for curve in curves]
+        names = {curve.label: _name(curve) for curve in every}
+        labels = list(names)
+        for number, (axes, (tag, curves)) in enumerate(zip(grid.flat, panels.items(), strict=False)):
+            for curve in curves:
+                _draw(axes, curve, labels.index(curve.label))
+            name, unit = SCALARS.get(tag, (tag, ""))
+            axes.set_title(name)
+            axes.set_ylabel(unit)
+            _scale_x(axes, x)
+            if number < len(panels) - columns:
+                axes.set_xlabel("")  # said below, in the same column
+        for axes in grid.flat[len(panels) :]:
+            axes.remove()
+        right = max(axes.get_xlim()[1] for axes in figure.axes)
+        for axes in figure.axes:
+            axes.set_xlim(0, right)
+        figure.suptitle(title if len(labels) > 1 else f"{title}: {names[labels[0]]}", fontsize=9, x=0.01, ha="left")
+        handles = {line.get_label(): line for axes in figure.axes for line in axes.lines if line.get_label() in names}
+        if len(labels) > 1:
+            shown = [handles[label] for label in labels]
+            legend = figure.legend(shown, names.values(), loc="outside upper right", ncols=len(labels))
+            for text, label in zip(legend.get_texts(), labels, strict=True):
+                text.set_color(line_style(labels.index(label))["color"])
+        note(figure, _explained(every, ""))
+        return save(figure, output)
+
+
+def _title(run: Run) -> str:
+    return f"{run.algo} on {run.env}" + ("" if run.seed is None else f", seed {run.seed}")
+
+
+def plot_training(folder: Path, output: Path | None = None, window: int = 20) -> Path:
+    """
+    Draw one run: returns of its training episodes and evaluations against environment steps.
+
+    :param folder: run folder
     :param output: image file, ``training.png`` in the run folder if not given
     :param window: number of episodes in the running mean
     :return: the image file
+    :raises ValueError: if the folder is no run folder, or a file in it is damaged
     """
-    steps, returns = read_monitors(run)
-    figure = Figure(figsize=(7, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    if len(steps):
-        axes.plot(steps, returns, ".", color=_TRAINING, alpha=0.3, markersize=4, label="training episode")
-        if len(steps) > 1:
-            label = f"mean of the last {window} episodes"
-            axes.plot(steps, running_mean(returns, window), color=_TRAINING, linewidth=1.8, label=label)
-    evaluations = run / "evaluations.npz"
-    if evaluations.exists():
-        with np.load(evaluations) as data:
-            at, results = data["timesteps"], data["results"]
-        mean, spread = results.mean(axis=1), results.std(axis=1)
-        label = f"evaluation, mean ± std of {results.shape[1]} episodes"
-        axes.errorbar(at, mean, spread, fmt="o-", color=_EVALUATION, markersize=4, linewidth=1.2, capsize=2.5, label=label)
-    if axes.has_data():
-        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize="small")  # beside the data, never over it
-    else:
-        axes.text(0.5, 0.5, "no finished episode", ha="center", va="center", transform=axes.transAxes)
-    axes.set_title(_title(run))
-    axes.set_xlabel("environment steps")
-    axes.set_ylabel("return per episode (sum of raw rewards)")
-    axes.set_xlim(left=0)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.grid(alpha=0.25)
-    output = output or run / "training.png"
-    figure.savefig(output, dpi=150)
-    return output
+    run = open_run(folder)
+    with house_style():
+        figure = new_figure(7.0, 3.8)
+        axes = figure.add_subplot()
+        ends = []
+        if run.episodes is not None and len(run.episodes.steps):
+            steps, mean = episode_curve(run, "steps", "reward", window)
+            color = COLORS[0]
+            axes.plot(run.episodes.steps, run.episodes.returns, ".", color=color, alpha=0.3, markersize=4, linewidth=0)
+            axes.plot(steps, mean, color=color)
+            ends.append((f"training,\nmean of {window}", float(mean[-1]), color))
+        if run.evaluations is not None and len(run.evaluations.steps):
+            returns = run.evaluations.returns
+            axes.errorbar(
+                run.evaluations.steps,
+                returns.mean(axis=1),
+                returns.std(axis=1),
+                color=COLORS[1],
+                fmt="o-",
+                markersize=3.5,
+                linewidth=1.2,
+                capsize=2,
+                elinewidth=0.8,
+            )
+            ends.append(("evaluation", float(returns[-1].mean()), COLORS[1]))
+            note(
+                figure,
+                f"dots: training episodes; evaluation: mean ± standard deviation of {returns.shape[1]} episodes, "
+                "deterministic policy",
+            )
+        if not ends:
+            axes.text(0.5, 0.5, "no finished episode", ha="center", va="center", transform=axes.transAxes)
+        axes.set_title(_title(run))
+        axes.set_ylabel(_Y_LABELS["reward"])
+        _scale_x(axes, "steps")
+        name_lines(figure, axes, ends)
+        return save(figure, output or folder / "training.png")

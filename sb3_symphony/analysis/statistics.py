@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sb3_symphony.analysis.runs import read_episodes, read_evaluations
+
 #: numbers drawn at once, 32 MB
 _CHUNK = 4_000_000
 
@@ -237,13 +239,11 @@ def run_events(run: Path, threshold: float = 300.0, unstable_below: float = 200.
     :param unstable_below: return below which a later evaluation episode counts as a failure
     :return: what the run reached; returns are those of the environment, warm-up episodes count
     """
-    from sb3_symphony.analysis.plots import read_monitors
-
-    steps, returns = read_monitors(run)
+    episodes, evaluations = read_episodes(run), read_evaluations(run)
+    steps, returns = (episodes.steps, episodes.returns) if episodes else (np.empty(0, dtype=np.int64), np.empty(0))
     timesteps, results = np.empty(0, dtype=np.int64), np.empty((0, 1))
-    if (run / "evaluations.npz").exists():
-        with np.load(run / "evaluations.npz") as data:
-            timesteps, results = data["timesteps"], data["results"]
+    if evaluations:
+        timesteps, results = evaluations.steps, evaluations.returns
     stable = first_stable_evaluation(timesteps, results, threshold)
     failed, counted = unstable_episodes(timesteps, results, stable, unstable_below)
     return RunEvents(

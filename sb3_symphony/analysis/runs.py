@@ -1,0 +1,308 @@
+"""What the files of runs say, as arrays; run folders of RL Zoo are read too. No algorithm is imported."""
+
+import csv
+import json
+import zipfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+
+class NotRecorded(ValueError):
+    """Something that is asked for is not in the files of a run."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """
+    Training episodes in the order of their ends, those of parallel environments merged. All arrays have shape ``(n,)``.
+
+    :param steps: environment steps at the end of each, summed over all environments
+    :param seconds: wall-clock time at the end of each, since the run began
+    :param returns: sum of raw rewards
+    :param lengths: number of steps
+    :param successes: whether the task was solved; None if the environment does not tell
+    """
+
+    steps: np.ndarray
+    seconds: np.ndarray
+    returns: np.ndarray
+    lengths: np.ndarray
+    successes: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Evaluations:
+    """
+    Evaluations in the course of training.
+
+    :param steps: environment steps before each, shape ``(n,)``
+    :param returns: sum of raw rewards, shape ``(n, episodes)``
+    :param lengths: number of steps, shape ``(n, episodes)``
+    :param successes: whether the task was solved, shape ``(n, episodes)``; None if the environment does not tell
+    """
+
+    steps: np.ndarray
+    returns: np.ndarray
+    lengths: np.ndarray
+    successes: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """
+    One quantity logged for TensorBoard. All arrays have shape ``(n,)``.
+
+    :param steps: environment steps
+    :param seconds: wall-clock time since the log began
+    :param values: the quantity
+    """
+
+    steps: np.ndarray
+    seconds: np.ndarray
+    values: np.ndarray
+
+
+def read_episodes(folder: Path) -> Episodes | None:
+    """
+    Read the ``*.monitor.csv`` of a run. Lines cut short by a crash are left out.
+
+    :param folder: run folder
+    :return: its training episodes, None if there are no such files
+    :raises ValueError: if a file is something else
+    """
+    paths = sorted(folder.glob("*.monitor.csv"))
+    if not paths:
+        return None
+    starts: list[float] = []
+    rows: list[tuple[float, float, int, float]] = []  # time of the end, return, length, success
+    for path in paths:
+        try:
+            with path.open(encoding="utf-8", newline="") as lines:
+                starts.append(float(json.loads(lines.readline().removeprefix("#"))["t_start"]))
+                rows += _monitor_rows(csv.DictReader(lines), starts[-1])
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            raise ValueError(f"{path}: not a monitor file of Stable-Baselines3, or damaged — {error}") from None
+    rows.sort(key=lambda row: row[0])
+    ends, returns, lengths, successes = np.array(rows, dtype=float).reshape(-1, 4).T
+    return Episodes(
+        steps=np.cumsum(lengths).astype(np.int64),
+        seconds=ends - min(starts),
+        returns=returns,
+        lengths=lengths.astype(np.int64),
+        successes=None if np.isnan(successes).any() or not rows else successes,
+    )
+
+
+def _monitor_rows(rows: csv.DictReader, start: float) -> Iterator[tuple[float, float, int, float]]:
+    before, pause = 0.0, 0.0
+    for row in rows:
+        try:
+            seconds, result = float(row["t"]), (float(row["r"]), int(row["l"]))
+            success = {"True": 1.0, "False": 0.0, None: np.nan}[row.get("is_success")]
+        except (TypeError, ValueError, KeyError):
+            continue
+        if seconds < before:  # a resumed run counts from zero again
+            pause += before
+        before = seconds
+        yield (start + pause + seconds, *result, success)
+
+
+def read_evaluations(folder: Path) -> Evaluations | None:
+    """
+    Read the ``evaluations.npz`` of a run.
+
+    :param folder: run folder
+    :return: its evaluations, None if there is no such file
+    :raises ValueError: if the file is something else
+    """
+    path = folder / "evaluations.npz"
+    if not path.exists():
+        return None
+    try:
+        with np.load(path) as data:
+            successes = data["successes"].astype(float) if "successes" in data else None
+            return Evaluations(data["timesteps"], data["results"], data["ep_lengths"], successes)
+    except (OSError, KeyError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: not evaluations of Stable-Baselines3, or damaged — {error}") from None
+
+
+def read_scalars(folder: Path) -> dict[str, Scalar]:
+    """
+    Read the scalars of a TensorBoard log, without thinning them.
+
+    :param folder: folder of event files
+    :return: name of each quantity → its course
+    """
+    from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
+
+    events = EventAccumulator(str(folder), size_guidance={SCALARS: 0}).Reload()
+    scalars = {}
+    start = events.FirstEventTimestamp() if events.Tags()["scalars"] else 0.0
+    for tag in events.Tags()["scalars"]:
+        points = events.Scalars(tag)
+        steps, times, values = (np.array([getattr(p, field) for p in points]) for field in ("step", "wall_time", "value"))
+        scalars[tag] = Scalar(steps, times - start, values)
+    return scalars
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Runs
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    A run folder, or the folder of a TensorBoard log alone.
+
+    :param path: the folder
+    :param algo: name of the algorithm
+    :param env: id of the environment
+    :param seed: seed, None if it is not recorded
+    :param config: hyper-parameters, empty if they are not recorded as plain YAML
+    :param log: folder of its TensorBoard log, None if there is none
+    """
+
+    path: Path
+    algo: str
+    env: str
+    seed: int | None
+    config: dict[str, Any]
+    log: Path | None
+
+    @cached_property
+    def episodes(self) -> Episodes | None:
+        """Training episodes, see :func:`read_episodes`."""
+        return read_episodes(self.path)
+
+    @cached_property
+    def evaluations(self) -> Evaluations | None:
+        """Evaluations, see :func:`read_evaluations`."""
+        return read_evaluations(self.path)
+
+    @cached_property
+    def scalars(self) -> dict[str, Scalar]:
+        """Scalars of the TensorBoard log, see :func:`read_scalars`; empty if there is none."""
+        return read_scalars(self.log) if self.log else {}
+
+
+def _plain_mapping(path: Path) -> dict[str, Any]:
+    """A YAML mapping of plain values; empty if it is none (RL Zoo's files hold Python objects)."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def open_run(folder: Path) -> Run:
+    """
+    :param folder: run folder, or folder of TensorBoard event files
+    :return: the run
+    :raises ValueError: if it is neither
+    """
+    name, _, number = folder.absolute().name.rpartition("_")
+    if any(folder.glob("events.out.tfevents.*")):  # SB3: <log>/<name>_<number>
+        return Run(folder, (name or number).lower(), folder.absolute().parent.name, None, {}, folder)
+    if not any(folder.glob("*.monitor.csv")) and not any(folder.glob("*/config.yml")):
+        what = "no run folder and no TensorBoard log" if folder.is_dir() else "no such folder"
+        raise ValueError(f"{folder}: {what} — expected one such as logs/symphony/BipedalWalker-v3_1")
+    details = next((path.parent for path in sorted(folder.glob("*/config.yml"))), folder / name)
+    options, config = (_plain_mapping(details / file) for file in ("args.yml", "config.yml"))
+    log = details / "tensorboard.txt"
+    return Run(
+        folder,
+        algo=str(options.get("algo", folder.absolute().parent.name)),
+        env=str(options.get("env", details.name)),
+        seed=options.get("seed"),
+        config=config,
+        log=Path(log.read_text(encoding="utf-8").strip()) if log.exists() else None,
+    )
+
+
+def find_runs(folder: Path, algos: Iterable[str], envs: Iterable[str]) -> list[Run]:
+    """
+    Find runs in ``<folder>/<algo>/<env>_<k>/``.
+
+    :param folder: where runs are kept
+    :param algos: names of algorithms; none: all
+    :param envs: ids of environments; none: all
+    :return: the runs, by algorithm in the order given, environment and number
+    """
+    algos, envs = list(algos), [env.rpartition(":")[2].replace("/", "-") for env in envs]
+    found = []
+    for path in folder.glob("*/*_*"):
+        name, _, number = path.name.rpartition("_")
+        algo = path.parent.name
+        if number.isdecimal() and (not algos or algo in algos) and (not envs or name in envs):
+            if any(path.glob("*.monitor.csv")) or any(path.glob("*/config.yml")):
+                found.append(((algos.index(algo) if algos else 0, algo, name, int(number)), path))
+    return [open_run(path) for _, path in sorted(found)]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Runs that differ in their seed only
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Group:
+    """
+    Runs of one algorithm with the same hyper-parameters on one environment.
+
+    :param label: what to call them in a figure
+    :param env: id of the environment
+    :param runs: one for each seed
+    """
+
+    label: str
+    env: str
+    runs: list[Run]
+
+
+def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    flat = {}
+    for key, value in config.items():
+        flat.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: str(value)})
+    return flat
+
+
+def group_runs(runs: Iterable[Run]) -> list[Group]:
+    """
+    Put runs together that differ in seed and length only.
+
+    Groups of the same algorithm and environment are told apart by up to two hyper-parameters that differ, else by the
+    names of their folders.
+
+    :param runs: any runs
+    :return: groups in the order of their first runs
+    """
+    groups: list[Group] = []
+    settings: list[dict[str, str]] = []
+    for run in runs:
+        own = {key: value for key, value in _flat(run.config).items() if key != "n_timesteps"}
+        for group, setting in zip(groups, settings, strict=True):
+            if (group.label, group.env, setting) == (run.algo, run.env, own):
+                group.runs.append(run)
+                break
+        else:
+            groups.append(Group(run.algo, run.env, [run]))
+            settings.append(own)
+
+    labelled = []
+    for group, setting in zip(groups, settings, strict=True):
+        alike = [s for g, s in zip(groups, settings, strict=True) if (g.label, g.env) == (group.label, group.env)]
+        keys = sorted({key for other in alike for key in {*setting, *other} if setting.get(key) != other.get(key)})
+        label = group.label
+        if 0 < len(keys) <= 2:
+            label += " " + ", ".join(f"{key.rpartition('.')[2]} {setting.get(key, 'default')}" for key in keys)
+        elif keys:
+            label += f" {', '.join(run.path.absolute().name.rpartition('_')[2] for run in group.runs)}"
+        labelled.append(replace(group, label=label))
+    return labelled

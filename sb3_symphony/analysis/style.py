@@ -1,0 +1,157 @@
+"""House style of all figures: readable in print, in greyscale and for colour-blind readers; names stand at the lines."""
+
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+#: Okabe and Ito's colours, the light ones darkened so that text in them is readable on white
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#A8467F", "#000000", "#B27500", "#2E8BBF")
+#: told apart in greyscale too
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)), (0, (3, 1, 1, 1, 1, 1)), "-")
+GREY = "#555555"
+SUFFIXES = (".png", ".svg", ".pdf")
+
+_STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.5,
+    "axes.axisbelow": True,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "lines.linewidth": 1.8,
+    "lines.solid_capstyle": "round",
+    "svg.hashsalt": "sb3-symphony",  # the same figure gives the same file
+}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Draw in the house style inside the block; settings of the caller's own figures stay as they are."""
+    with rc_context(_STYLE):
+        yield
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """
+    :param width: inches
+    :param height: inches
+    :return: an empty figure that no display is needed for
+    """
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def check_suffix(output: Path) -> None:
+    """
+    :param output: image file
+    :raises ValueError: if its name does not end in one of :data:`SUFFIXES`
+    """
+    if output.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{output}: expected a name that ends in {', '.join(SUFFIXES)}")
+
+
+def save(figure: Figure, output: Path) -> Path:
+    """
+    :param figure: what to save
+    :param output: image file, its kind told by its suffix
+    :return: the file
+    """
+    check_suffix(output)
+    undated = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}[output.suffix.lower()]
+    figure.savefig(output, dpi=200, metadata=undated)
+    return output
+
+
+def line_style(index: int) -> dict[str, Any]:
+    """
+    :param index: of a group of runs, from 0 on
+    :return: colour and dashes
+    """
+    return {"color": next(islice(cycle(COLORS), index, None)), "linestyle": next(islice(cycle(DASHES), index, None))}
+
+
+def note(figure: Figure, text: str) -> None:
+    """
+    Say under a figure what its lines are.
+
+    :param figure: the figure
+    :param text: what to say
+    """
+    width = int(figure.get_figwidth() * 17)  # letters of this size in a line
+    figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=7.5, color=GREY)
+
+
+def spread(positions: Sequence[float], gap: float) -> np.ndarray:
+    """
+    Move positions apart as little as needed, keeping their order.
+
+    :param positions: shape ``(n,)``
+    :param gap: least distance between two of them
+    :return: new positions, shape ``(n,)``
+    """
+    order = np.argsort(positions, kind="stable")
+    placed = np.array(positions, dtype=float)[order]
+    clusters: list[tuple[float, list[float]]] = []  # where the first stands, and the wishes of its members minus their rank
+    for wish in placed:
+        first, members = wish, [wish]
+        while clusters and clusters[-1][0] + len(clusters[-1][1]) * gap > first:
+            _, before = clusters.pop()
+            members = [*before, *(member - len(before) * gap for member in members)]
+            first = float(np.mean(members))
+        clusters.append((first, members))
+    placed = np.concatenate([first + gap * np.arange(len(members)) for first, members in clusters]) if clusters else placed
+    result = np.empty_like(placed)
+    result[order] = placed
+    return result
+
+
+def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, str]]) -> None:
+    """
+    Write names at the right of a panel, each at the height where its line ends.
+
+    :param figure: the figure
+    :param axes: the panel, everything drawn
+    :param ends: name, last value and colour of each line
+    """
+    if not ends:
+        return
+    figure.draw_without_rendering()  # settles limits and sizes
+    to_axes = axes.transData + axes.transAxes.inverted()
+    size = 8.5
+    height = axes.get_window_extent().height * 72 / figure.dpi
+    wished = [float(to_axes.transform((0.0, value))[1]) for _, value, _ in ends]
+    gap = size * 1.25 / height
+    placed = spread([min(max(at, 0.0), 1.0) for at in wished], gap)
+    for (text, _, color), at in zip(ends, placed, strict=True):
+        axes.annotate(
+            text,
+            (1.0, at),
+            (5, 0),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            color=color,
+            fontsize=size,
+            va="center",
+            annotation_clip=False,
+        )

@@ -1,0 +1,209 @@
+"""What ``sb3-symphony plot`` draws: from options of the command line to runs, their curves, and an image."""
+
+import json
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from sb3_symphony.common.checks import suggestion
+from sb3_symphony.experiment.config import ConfigError
+
+if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
+    from sb3_symphony.analysis.plots import Curve, Line
+    from sb3_symphony.analysis.runs import Group, Run
+
+
+class PlotOptions(BaseModel):
+    """Options of ``sb3-symphony plot``; their meaning is in its ``--help``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    runs: list[str] = []
+    algo: list[str] = []
+    env: list[str] = []
+    folder: str = "logs"
+    evaluations: bool = False
+    scalars: bool = False
+    tags: list[str] = []
+    x_axis: Literal["steps", "episodes", "time"] = "steps"
+    y_axis: Literal["reward", "length", "success"] = "reward"
+    episode_window: int = Field(default=100, ge=1)
+    mean_per: int | None = Field(default=None, ge=1)
+    max_timesteps: int | None = Field(default=None, ge=1)
+    labels: list[str] = []
+    output: str | None = None
+    json_file: str | None = None
+
+    @property
+    def kind(self) -> str:
+        """What is drawn."""
+        return "scalars" if self.scalars or self.tags else "evaluations" if self.evaluations else "training"
+
+
+def plot(options: PlotOptions) -> Path:
+    """
+    Draw the curves of runs.
+
+    :param options: options of the command line
+    :return: the image file
+    :raises ConfigError: if there are no such runs, they did not record what is to be drawn, or a file cannot be written
+    """
+    from sb3_symphony.analysis import plots, style
+
+    _check(options)
+    try:
+        groups = _groups(options)
+        output = Path(options.output or _default_output(options, groups))
+        style.check_suffix(output)
+        panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        if options.kind == "scalars":
+            title = ", ".join(dict.fromkeys(group.env for group in groups))
+            plots.plot_scalars(panels, options.x_axis, output, title)
+        else:
+            plots.plot_curves(panels, options.x_axis, options.y_axis, _smoothed(options), output)
+        if options.json_file:
+            content = {"x": options.x_axis, "panels": {k: [c.plain() for c in v] for k, v in panels.items()}}
+            if options.json_file == "-":
+                print(json.dumps(content))
+            else:
+                Path(options.json_file).write_text(json.dumps(content) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"'{error.filename}' cannot be written — {error.strerror}") from None
+    return output
+
+
+def _check(options: PlotOptions) -> None:
+    if options.evaluations and options.kind == "scalars":
+        raise ConfigError("--evaluations and --scalars: expected only one of them")
+    if options.mean_per is not None and options.kind != "training":
+        raise ConfigError(f"--mean-per: {options.mean_per} — is for training episodes, not for --{options.kind}")
+    if options.y_axis != "reward" and options.kind == "scalars":
+        raise ConfigError(f"-y: {options.y_axis} — is for episodes, not for --scalars")
+    if options.runs and (options.algo or options.env):
+        raise ConfigError(f"{options.runs[0]}: expected run folders, or -a and -e to look for runs, not both")
+
+
+def _groups(options: PlotOptions) -> "list[Group]":
+    """The runs that are meant, those that differ in their seed together."""
+    from sb3_symphony.analysis.runs import find_runs, group_runs, open_run
+
+    if options.runs:
+        runs = [open_run(Path(folder)) for folder in options.runs]
+    else:
+        runs = find_runs(Path(options.folder), options.algo, options.env)
+        for flag, wanted, there in (
+            ("-a", options.algo, {run.algo for run in find_runs(Path(options.folder), [], [])}),
+            ("-e", options.env, {run.env for run in find_runs(Path(options.folder), options.algo, [])}),
+        ):
+            for name in wanted:
+                if name not in there:
+                    known = suggestion(name, there) or (f" — there are runs of {', '.join(sorted(there))}" if there else "")
+                    raise ConfigError(f"{flag}: '{name}' — no such run in {options.folder}{known}")
+        if not runs:
+            raise ConfigError(f"no runs in '{options.folder}' — expected <algo>/<env>_<k>/ there; `train` makes them")
+    groups = group_runs(runs)
+    names = list(dict.fromkeys(group.label for group in groups))
+    if options.labels:
+        if len(options.labels) != len(names):
+            raise ConfigError(f"-l: {len(options.labels)} labels — expected {len(names)}, for {', '.join(names)}")
+        renamed = dict(zip(names, options.labels, strict=True))
+        groups = [replace(group, label=renamed[group.label]) for group in groups]
+    return groups
+
+
+def _default_output(options: PlotOptions, groups: "list[Group]") -> Path:
+    """One run's figure lies in its folder, those of several beside each other."""
+    if len(groups) == 1 and len(groups[0].runs) == 1:
+        return groups[0].runs[0].path / f"{options.kind}.png"
+    names = "_".join(dict.fromkeys(group.env.rpartition(":")[2].replace("/", "-") for group in groups))
+    return Path("" if options.runs else options.folder) / f"{names}_{options.kind}.png"
+
+
+def _lines(runs: "Iterable[Run]", line: "Callable[[Run], Line]", left_out: list[str]) -> "list[Line]":
+    """Lines of the runs that have recorded what is asked for; the others are told."""
+    from sb3_symphony.analysis.runs import NotRecorded
+
+    lines = []
+    for run in runs:
+        try:
+            x, y = line(run)
+            if len(x) == 0:
+                raise NotRecorded(f"{run.path}: nothing to draw yet")
+            lines.append((x, y))
+        except NotRecorded as error:
+            left_out.append(str(error))
+    return lines
+
+
+def _told(panels: "dict[str, list[Curve]]", left_out: list[str]) -> "dict[str, list[Curve]]":
+    if not panels:
+        raise ConfigError(left_out[0])
+    for message in dict.fromkeys(left_out):
+        print(f"left out: {message}", file=sys.stderr)
+    return panels
+
+
+def _curve_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, list[Curve]]":
+    """A panel for each environment, a curve for each group."""
+    from sb3_symphony.analysis.plots import episode_curve, evaluation_curve, summarised
+
+    def line(run: "Run") -> "Line":
+        if options.evaluations:
+            return evaluation_curve(run, options.x_axis, options.y_axis, options.max_timesteps)
+        return episode_curve(
+            run, options.x_axis, options.y_axis, options.episode_window, options.mean_per, options.max_timesteps
+        )
+
+    panels: dict[str, list[Curve]] = {}
+    left_out: list[str] = []
+    for group in groups:
+        lines = _lines(group.runs, line, left_out)
+        if lines:
+            panels.setdefault(group.env, []).append(summarised(group.label, lines))
+    return _told(panels, left_out)
+
+
+def _scalar_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, list[Curve]]":
+    """A panel for each quantity, a curve for each group that has logged it."""
+    from sb3_symphony.analysis.plots import SCALARS, scalar_curve, summarised
+
+    logged = {tag for group in groups for run in group.runs for tag in run.scalars}
+    for tag in options.tags:
+        if tag not in logged:
+            known = suggestion(tag, logged) or f" — logged are {', '.join(sorted(logged)) or 'none'}"
+            raise ConfigError(f"--tags: '{tag}' — no run has logged it{known}")
+    several = len({group.env for group in groups}) > 1
+    panels: dict[str, list[Curve]] = {}
+    left_out = [
+        f"{run.path}: no TensorBoard log is known — `train -tb` writes one; a log's own folder can be given instead"
+        for group in groups
+        for run in group.runs
+        if run.log is None
+    ]
+    for tag in options.tags or [tag for tag in SCALARS if tag in logged] or sorted(logged):
+        for group in groups:
+            lines = _lines(
+                [run for run in group.runs if tag in run.scalars],
+                lambda run, tag=tag: scalar_curve(run, tag, options.x_axis, options.max_timesteps),  # type: ignore[misc]
+                left_out,
+            )
+            if lines:
+                label = f"{group.label} on {group.env}" if several else group.label
+                panels.setdefault(tag, []).append(summarised(label, lines))
+    return _told(panels, left_out)
+
+
+def _smoothed(options: PlotOptions) -> str:
+    if options.kind == "evaluations":
+        return "mean of each evaluation's episodes"
+    if options.mean_per is not None:
+        return f"mean of every {options.mean_per} episodes"
+    return f"running mean of {options.episode_window} episodes" if options.episode_window > 1 else ""

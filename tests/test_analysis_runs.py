@@ -1,0 +1,156 @@
+"""Files of runs, as arrays."""
+
+import numpy as np
+import pytest
+import yaml
+from torch.utils.tensorboard import SummaryWriter
+
+from sb3_symphony.analysis.runs import find_runs, group_runs, open_run, read_episodes, read_evaluations, read_scalars
+
+
+def write_monitor(path, start, rows, columns="r,l,t"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [f'#{{"t_start": {start}, "env_id": "X"}}', columns, *(",".join(map(str, row)) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def make_run(folder, algo="sac", env="X-v0", seed=0, number=1, **config):
+    path = folder / algo / f"{env}_{number}"
+    write_monitor(path / "0.monitor.csv", 0.0, [(1.0, 10, 1.0)])
+    (path / env).mkdir()
+    (path / env / "args.yml").write_text(yaml.safe_dump({"algo": algo, "env": env, "seed": seed}))
+    (path / env / "config.yml").write_text(yaml.safe_dump({"n_timesteps": 100, **config}))
+    return path
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_parallel_environments_are_merged_by_time(tmp_path):
+    write_monitor(tmp_path / "0.monitor.csv", 100.0, [(1.0, 10, 1.0), (3.0, 20, 5.0)])
+    write_monitor(tmp_path / "1.monitor.csv", 101.0, [(2.0, 15, 1.5)])
+    episodes = read_episodes(tmp_path)
+    np.testing.assert_array_equal(episodes.steps, [10, 25, 45])
+    np.testing.assert_array_equal(episodes.returns, [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(episodes.lengths, [10, 15, 20])
+    np.testing.assert_array_equal(episodes.seconds, [1.0, 2.5, 5.0])
+    assert episodes.successes is None
+
+
+def test_a_torn_last_line_is_left_out(tmp_path):
+    write_monitor(tmp_path / "0.monitor.csv", 0.0, [(1.0, 10, 1.0)])
+    with (tmp_path / "0.monitor.csv").open("a") as file:
+        file.write("-12.3,")
+    assert len(read_episodes(tmp_path).returns) == 1
+
+
+def test_time_of_a_resumed_run_goes_on(tmp_path):
+    write_monitor(tmp_path / "0.monitor.csv", 50.0, [(1, 10, 1.0), (1, 10, 8.0), (2, 10, 0.5), (3, 10, 3.0)])
+    np.testing.assert_array_equal(read_episodes(tmp_path).seconds, [1.0, 8.0, 8.5, 11.0])
+
+
+def test_successes(tmp_path):
+    write_monitor(tmp_path / "0.monitor.csv", 0.0, [(1, 10, 1.0, True), (1, 10, 2.0, False)], "r,l,t,is_success")
+    np.testing.assert_array_equal(read_episodes(tmp_path).successes, [1.0, 0.0])
+
+
+def test_no_episode_yet(tmp_path):
+    assert read_episodes(tmp_path) is None and read_evaluations(tmp_path) is None
+    write_monitor(tmp_path / "0.monitor.csv", 0.0, [])
+    assert read_episodes(tmp_path).steps.shape == (0,)
+
+
+def test_damaged_files(tmp_path):
+    (tmp_path / "0.monitor.csv").write_text("r,l,t\n1,2,3\n")
+    with pytest.raises(ValueError, match=r"0\.monitor\.csv: not a monitor file"):
+        read_episodes(tmp_path)
+    (tmp_path / "evaluations.npz").write_bytes(b"PK\x03\x04 nothing")
+    with pytest.raises(ValueError, match=r"evaluations\.npz: not evaluations"):
+        read_evaluations(tmp_path)
+    np.savez(tmp_path / "evaluations.npz", timesteps=[1])
+    with pytest.raises(ValueError, match=r"evaluations\.npz: not evaluations"):
+        read_evaluations(tmp_path)
+
+
+def test_scalars_are_not_thinned(tmp_path):
+    with SummaryWriter(tmp_path) as writer:
+        for step in range(0, 30_000, 10):
+            writer.add_scalar("train/x", step**0.5, step, walltime=1000.0 + step)
+    scalar = read_scalars(tmp_path)["train/x"]
+    np.testing.assert_array_equal(scalar.steps, np.arange(0, 30_000, 10))
+    np.testing.assert_allclose(scalar.values, scalar.steps**0.5, rtol=1e-6)
+    np.testing.assert_allclose(np.diff(scalar.seconds), 10.0)
+
+
+# ---------------------------------------------------------------- folders
+
+
+def test_open_run(tmp_path):
+    path = make_run(tmp_path, "td3", "Y-v1", seed=7, gamma=0.9)
+    run = open_run(path)
+    assert (run.algo, run.env, run.seed, run.config["gamma"], run.log) == ("td3", "Y-v1", 7, 0.9, None)
+    (path / "Y-v1" / "tensorboard.txt").write_text("some/where\n")
+    assert open_run(path).log.parts == ("some", "where")
+
+
+def test_folders_of_rl_zoo_are_read(tmp_path):
+    path = make_run(tmp_path, "ppo", "CartPole-v1")
+    for name in ("args.yml", "config.yml"):
+        text = "!!python/object/apply:collections.OrderedDict\n- - - algo\n    - ppo\n"
+        (path / "CartPole-v1" / name).write_text(text)
+    run = open_run(path)
+    assert (run.algo, run.env, run.seed, run.config) == ("ppo", "CartPole-v1", None, {})
+
+
+def test_a_tensorboard_log_alone(tmp_path):
+    with SummaryWriter(tmp_path / "Y-v1" / "SAC_3") as writer:
+        writer.add_scalar("train/x", 1.0, 1)
+    run = open_run(tmp_path / "Y-v1" / "SAC_3")
+    assert (run.algo, run.env, list(run.scalars)) == ("sac", "Y-v1", ["train/x"])
+
+
+def test_no_run(tmp_path):
+    with pytest.raises(ValueError, match="no such folder"):
+        open_run(tmp_path / "x")
+    with pytest.raises(ValueError, match="no run folder and no TensorBoard log"):
+        open_run(tmp_path)
+
+
+def test_find_runs_takes_names_exactly(tmp_path):
+    for algo, env, number in [
+        ("sac", "W-v3", 1),
+        ("sac", "W-v3", 10),
+        ("sac", "W-v3", 2),
+        ("td3", "W-v3", 1),
+        ("sac", "WHard-v3", 1),
+    ]:
+        make_run(tmp_path, algo, env, number=number)
+    (tmp_path / "sac" / "W-v3_77").mkdir()  # not a run
+    names = [str(run.path.relative_to(tmp_path)) for run in find_runs(tmp_path, ["td3", "sac"], ["W-v3"])]
+    assert names == ["td3/W-v3_1", "sac/W-v3_1", "sac/W-v3_2", "sac/W-v3_10"]
+    assert len(find_runs(tmp_path, [], [])) == 5
+    assert find_runs(tmp_path / "none", [], []) == []
+
+
+# ---------------------------------------------------------------- groups
+
+
+def test_seeds_of_one_configuration_are_a_group(tmp_path):
+    runs = [open_run(make_run(tmp_path, seed=k, number=k + 1, gamma=0.9)) for k in range(3)]
+    longer = make_run(tmp_path, seed=3, number=4, gamma=0.9)
+    (longer / "X-v0" / "config.yml").write_text(yaml.safe_dump({"n_timesteps": 999, "gamma": 0.9}))
+    groups = group_runs([*runs, open_run(longer), open_run(make_run(tmp_path, "td3"))])
+    assert [(group.label, len(group.runs)) for group in groups] == [("sac", 4), ("td3", 1)]
+
+
+def test_groups_are_told_apart_by_what_differs(tmp_path):
+    paths = [
+        make_run(tmp_path, number=1, gamma=0.9, policy_kwargs={"net_arch": [64], "n_critics": 2}),
+        make_run(tmp_path, number=2, gamma=0.9, policy_kwargs={"net_arch": [64], "n_critics": 5}),
+        make_run(tmp_path, number=3, gamma=0.9, policy_kwargs={"net_arch": [64]}),
+        make_run(tmp_path, number=4, env="Z-v0", gamma=0.5),
+    ]
+    labels = [group.label for group in group_runs(map(open_run, paths))]
+    assert labels == ["sac n_critics 2", "sac n_critics 5", "sac n_critics default", "sac"]
+    paths = [make_run(tmp_path, "td3", number=1, a=1, b=1, c=1), make_run(tmp_path, "td3", number=2, a=2, b=2, c=2)]
+    assert [group.label for group in group_runs(map(open_run, paths))] == ["td3 1", "td3 2"]
