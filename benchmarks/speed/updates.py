@@ -11,21 +11,17 @@ meets all of them alike: trust the ratios. The process is pinned to as many core
 
 import argparse
 import copy
-import importlib.metadata
 import itertools
-import json
-import os
-import platform
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from datetime import date
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import torch as th
+from measuring import pin, write
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.logger import configure
@@ -34,6 +30,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_symphony import REDQ, Symphony
+from sb3_symphony.common.regression import has_bfloat16
 
 SHAPES = {"BipedalWalker": (24, 4), "Hopper": (11, 3), "Humanoid": (348, 17)}
 UPDATES_PER_TURN = 20
@@ -219,6 +216,18 @@ class BareProducts:
             self.hidden[0] @ self.actor[2]
 
 
+def critic_step(model: REDQ | Symphony, setting: Setting) -> Turn:
+    """The critics' step alone, toward a given target."""
+    data = model.replay_buffer.sample(setting.batch)
+    target = th.randn(setting.batch, 1)
+
+    def critic(n_updates: int) -> None:
+        for _ in range(n_updates):
+            model._regression.fit(data.observations, data.actions, target, 0.005)
+
+    return critic
+
+
 def redq(setting: Setting, engine: str) -> tuple[Turn, Turn]:
     model = prepared(
         REDQ(
@@ -233,14 +242,7 @@ def redq(setting: Setting, engine: str) -> tuple[Turn, Turn]:
             device="cpu",
         )
     )
-    data = model.replay_buffer.sample(setting.batch)
-    target = th.randn(setting.batch, 1)
-
-    def critic(n_updates: int) -> None:
-        for _ in range(n_updates):
-            model._regression.fit(data.observations, data.actions, target, 0.005)
-
-    return critic, lambda n_updates: model.train(gradient_steps=n_updates, batch_size=setting.batch)
+    return critic_step(model, setting), lambda n_updates: model.train(gradient_steps=n_updates, batch_size=setting.batch)
 
 
 def sb3(setting: Setting, algorithm=SAC, **policy_kwargs) -> tuple[Turn | None, Turn]:
@@ -308,33 +310,33 @@ def separate(setting: Setting) -> tuple[Turn, Turn]:
     return critic, loop.train
 
 
-def symphony(setting: Setting, engine: str) -> tuple[None, Turn]:
+def symphony(setting: Setting, engine: str, policy_delay: int = 1) -> tuple[Turn, Turn]:
     model = prepared(
         Symphony(
             "MlpPolicy",
             Shape(setting.shape),
-            n_critics=2,
+            n_critics=setting.n_critics,
+            policy_delay=policy_delay,
             initial_gradient_steps=(0, 0),
             policy_kwargs=dict(net_arch=[setting.width] * 2, critic_engine=engine),
             device="cpu",
         )
     )
-    return None, lambda n_updates: model.train(gradient_steps=n_updates, batch_size=setting.batch)
+    return critic_step(model, setting), lambda n_updates: model.train(gradient_steps=n_updates, batch_size=setting.batch)
 
 
 def contestants(setting: Setting) -> dict[str, Callable[[], tuple[Turn | None, Turn]]]:
     """Constructors by name; the first one is what the others are compared with."""
+    ours = symphony if setting.name == "symphony" else redq
+    engines = ["fused", "autograd", *(["bf16"] if has_bfloat16() else [])]
+    constructors: dict[str, Callable] = {f"ours, {engine}": partial(ours, setting, engine) for engine in engines}
     if setting.name == "symphony":
-        return {
-            "ours, fused": lambda: symphony(setting, "fused"),
-            "ours, autograd": lambda: symphony(setting, "autograd"),
-            "SB3 TD3": lambda: sb3(setting, TD3),
-        }
+        constructors["ours, fused, policy_delay 2"] = partial(symphony, setting, "fused", policy_delay=2)
+        return {**constructors, "SB3 TD3 (policy_delay 2)": lambda: sb3(setting, TD3)}
     floor = BareProducts(setting)
     return {
-        "ours, fused": lambda: redq(setting, "fused"),
+        **constructors,
         "bare products": lambda: (floor.critic, floor.train),
-        "ours, autograd": lambda: redq(setting, "autograd"),
         "separate networks": lambda: separate(setting),
         "SB3 SAC": lambda: sb3(setting, n_critics=setting.n_critics),
         "SB3 SAC, our policy_delay": lambda: sb3(setting, DelayedSAC, n_critics=setting.n_critics),
@@ -392,43 +394,27 @@ def settings(quick: bool) -> list[Setting]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="the three settings of the targets, few turns, one thread")
+    parser.add_argument("--quick", action="store_true", help="the first three settings, few turns")
     parser.add_argument("--threads", type=int, default=1, help="threads, and cores the process is pinned to")
     parser.add_argument("--turns", type=int, help="counted turns per contestant (default 15, with --quick 7)")
-    parser.add_argument("--output", type=Path, help="JSON file")
+    parser.add_argument("--output", type=Path, help="JSON file, written after each setting")
     arguments = parser.parse_args()
-    turns = arguments.turns or (7 if arguments.quick else 15)
-
-    threads = arguments.threads
-    os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:threads]))
-    th.set_num_threads(threads)
+    pin(arguments.threads)
 
     rows: list[dict] = []
     for setting in settings(arguments.quick):
-        rows += measure(setting, turns)
-        print(f"\n{setting}, {threads} thread(s)")
-        for row in rows:
-            if all(row[key] == value for key, value in asdict(setting).items()):
-                low, high = row["ms_quartiles"]
-                spread = f"({low:.3f}, {high:.3f})"
-                print(f"  {row['contestant']:26s} {row['column']:7s} {row['ms']:8.3f} ms  {spread}  x {row['times_ours']:.2f}")
-    if arguments.output is not None:
-        packages = ("torch", "numpy", "stable-baselines3", "sb3-contrib", "sbx-rl", "jax")
-        record = {
-            "command": " ".join(["python", *sys.argv]),
-            "date": date.today().isoformat(),
-            "machine": {"processor": processor(), "instructions": th.backends.cpu.get_cpu_capability()},
-            "versions": {name: importlib.metadata.version(name) for name in packages},
-            "rows": rows,
-        }
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.write_text(json.dumps(record, indent=1) + "\n")
-
-
-def processor() -> str:
-    """Name of the processor, as Linux knows it."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
+        new = measure(setting, arguments.turns or (7 if arguments.quick else 15))
+        rows += new
+        print(f"\n{setting}, {arguments.threads} thread(s)")
+        for row in new:
+            low, high = row["ms_quartiles"]
+            spread = f"({low:.3f}, {high:.3f})"
+            print(
+                f"  {row['contestant']:26s} {row['column']:7s} {row['ms']:8.3f} ms  {spread}  x {row['times_ours']:.2f}",
+                flush=True,
+            )
+        if arguments.output is not None:
+            write(arguments.output, rows)
 
 
 if __name__ == "__main__":

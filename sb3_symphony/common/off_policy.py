@@ -23,6 +23,7 @@ from sb3_symphony.common.regression import make_regression
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
 N_STEP_BUFFERS = (NStepReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer)
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
+MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
 
 class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
@@ -150,7 +151,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         self, gradient_steps: int, batch_size: int, **sample_kwargs: Any
     ) -> Iterator[tuple[ReplayBufferSamples, list[ReplayBufferSamples]]]:
         """
-        Draw ``gradient_steps`` minibatches and cut them where the actor changes.
+        Draw ``gradient_steps`` minibatches and cut them where the actor changes, or earlier.
 
         A segment ends with every ``policy_delay``-th update (counted over the model's life), after which the caller steps
         the actor. Inside it the actor is frozen, so its next actions can be computed for all minibatches at once.
@@ -168,7 +169,8 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
             samples = self.replay_buffer.sample(draw * batch_size, env=self._vec_normalize_env, **sample_kwargs)
             start = 0
             while start < draw:
-                length = min(draw - start, self.policy_delay - self._n_updates % self.policy_delay)
+                until_actor = self.policy_delay - self._n_updates % self.policy_delay
+                length = min(draw - start, until_actor, max(1, MAX_SEGMENT_ROWS // batch_size))
                 batches = [_rows(samples, (start + i) * batch_size, batch_size) for i in range(length)]
                 yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
