@@ -89,8 +89,8 @@ def test_open_run(tmp_path):
     path = make_run(tmp_path, "td3", "Y-v1", seed=7, gamma=0.9)
     run = open_run(path)
     assert (run.algo, run.env, run.seed, run.config["gamma"], run.log) == ("td3", "Y-v1", 7, 0.9, None)
-    (path / "Y-v1" / "tensorboard.txt").write_text("some/where\n")
-    assert open_run(path).log.parts == ("some", "where")
+    (path / "Y-v1" / "tensorboard.txt").write_text("../../../tb/TD3_1\n")
+    assert open_run(path).log == tmp_path / "tb" / "TD3_1"
 
 
 def test_folders_of_rl_zoo_are_read(tmp_path):

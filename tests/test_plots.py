@@ -11,6 +11,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis import plots
 from sb3_symphony.analysis.plots import block_mean, plot_training, running_mean, summarised
+from sb3_symphony.analysis.runs import open_run, read_scalars
 from sb3_symphony.analysis.statistics import bootstrap_interval, iqm
 from sb3_symphony.analysis.style import COLORS, save, spread
 from sb3_symphony.cli import main
@@ -300,3 +301,18 @@ def test_a_run_without_evaluations_is_told(logs, capsys, figures):
     assert main(["plot", "--evaluations", "-e", "X-v0", "-a", "sac"]) == 0
     assert "left out: logs/sac/X-v0_2: has no evaluations.npz" in capsys.readouterr().err
     assert texts(figures[0].axes[0]) == ["sac, 2 seeds"]
+
+
+def test_the_log_of_a_run_is_found(tmp_path, monkeypatch, figures):
+    monkeypatch.chdir(tmp_path)
+    argv = "train --algo td3 --env Pendulum-v1 -n 450 --eval-freq 0 --no-progress --verbose 0 -tb tb --log-interval 1"
+    for seed in ("0", "1"):
+        assert main([*argv.split(), "--seed", seed, "-params", "learning_starts:100", "buffer_size:500"]) == 0
+    logs = [open_run(tmp_path / f"logs/td3/Pendulum-v1_{k}").log for k in (1, 2)]
+    assert logs == [tmp_path / f"tb/Pendulum-v1/TD3_{k}" for k in (1, 2)]
+    monkeypatch.chdir(tmp_path / "logs")
+    assert main(["plot", "-f", ".", "--tags", "train/actor_loss", "-o", "a.png"]) == 0
+    (_,), faint = lines(figures[-1].axes[0])
+    for (x, y), log in zip(faint, logs, strict=True):
+        scalar = read_scalars(log)["train/actor_loss"]
+        np.testing.assert_allclose([x, y], [scalar.steps, scalar.values])

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -222,7 +223,7 @@ def open_run(folder: Path) -> Run:
         env=str(options.get("env", details.name)),
         seed=options.get("seed"),
         config=config,
-        log=Path(log.read_text(encoding="utf-8").strip()) if log.exists() else None,
+        log=Path(os.path.normpath(details / log.read_text(encoding="utf-8").strip())) if log.exists() else None,
     )
 
 

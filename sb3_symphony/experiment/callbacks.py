@@ -121,6 +121,26 @@ class SeededEvaluation(EvalCallback):
             return False
 
 
+class NoteLogFolder(BaseCallback):
+    """
+    Writes down where the TensorBoard log of a run is, if it has one, so that figures of the run find it.
+
+    :param path: file, which will hold the folder relative to its own
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.path = path
+
+    def _on_training_start(self) -> None:
+        folder = self.logger.get_dir()
+        if folder is not None:
+            self.path.write_text(f"{os.path.relpath(folder, self.path.parent)}\n", encoding="utf-8")
+
+    def _on_step(self) -> bool:
+        return True
+
+
 class ReturnProgressBar(BaseCallback):
     """
     Live progress bar with the mean return of the latest ten training episodes and of the last evaluation.

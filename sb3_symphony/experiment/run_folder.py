@@ -106,6 +106,11 @@ class RunFolder:
         return [*sorted(self.path.glob("*.monitor.csv")), *self.path.glob("evaluations.npz")]
 
     @property
+    def log_folder(self) -> Path:
+        """File that says where the TensorBoard log is."""
+        return self.details / "tensorboard.txt"
+
+    @property
     def plot(self) -> Path:
         """Curve of returns."""
         return self.path / "training.png"

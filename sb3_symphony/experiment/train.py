@@ -18,7 +18,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.plots import plot_training
 from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of, record_episodes, write_atomically
-from sb3_symphony.experiment.callbacks import ReturnProgressBar, SaveNormalization, SeededEvaluation, StopOnSignal
+from sb3_symphony.experiment.callbacks import (
+    NoteLogFolder,
+    ReturnProgressBar,
+    SaveNormalization,
+    SeededEvaluation,
+    StopOnSignal,
+)
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config
 from sb3_symphony.experiment.decode import algorithm_arguments
 from sb3_symphony.experiment.environment import (
@@ -245,7 +251,7 @@ def _train(
             run.checkpoints, options.save_freq, options.keep, tuple(callbacks), files, checkpoint, wanted=stop.here
         )
         callbacks.append(checkpoints)
-    callbacks.append(stop)  # the checkpoint is made before
+    callbacks += [stop, NoteLogFolder(run.log_folder)]  # the checkpoint is made before
     if options.progress:
         bar = ReturnProgressBar(evaluation)
         callbacks.append(bar)
