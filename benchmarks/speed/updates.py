@@ -207,13 +207,33 @@ class BareProducts:
             th.bmm(self.inputs.t().expand(len(first), -1, -1), self.hidden)
 
     def train(self, n_updates: int) -> None:
-        """Critics, target subset and next actions; the actor's own step, once in ``policy_delay``, is left out."""
+        """Critics, target subset and next actions; once in ``policy_delay`` the actor's step."""
         self.critic(n_updates)
-        for _ in range(n_updates):
+        first, second, last = self.actor
+        for i in range(n_updates):
             self.forward(self.setting.subset)
-            self.states @ self.actor[0]
-            self.hidden[0] @ self.actor[1]
-            self.hidden[0] @ self.actor[2]
+            self.states @ first
+            self.hidden[0] @ second
+            self.hidden[0] @ last
+            if (i + 1) % self.setting.policy_delay == 0:
+                self.actor_step()
+
+    def actor_step(self) -> None:
+        """The actor forward, all critics forward and back to the actions, the actor back."""
+        first, second, last = self.actor
+        hidden = self.hidden[0]
+        self.states @ first
+        hidden @ second
+        actions = hidden @ last
+        self.forward(len(self.hidden))
+        th.bmm(self.grad, self.weights[2].transpose(1, 2))
+        th.bmm(self.hidden, self.weights[1].transpose(1, 2))
+        th.bmm(self.hidden, self.weights[0][:, self.states.shape[1] :].transpose(1, 2))
+        actions @ last.t()
+        hidden.t() @ actions
+        hidden @ second.t()
+        hidden.t() @ hidden
+        self.states.t() @ hidden
 
 
 def critic_step(model: REDQ | Symphony, setting: Setting) -> Turn:
@@ -330,13 +350,13 @@ def contestants(setting: Setting) -> dict[str, Callable[[], tuple[Turn | None, T
     ours = symphony if setting.name == "symphony" else redq
     engines = ["fused", "autograd", *(["bf16"] if has_bfloat16() else [])]
     constructors: dict[str, Callable] = {f"ours, {engine}": partial(ours, setting, engine) for engine in engines}
+    floor = BareProducts(setting)
+    constructors["bare products"] = lambda: (floor.critic, floor.train)
     if setting.name == "symphony":
         constructors["ours, fused, policy_delay 2"] = partial(symphony, setting, "fused", policy_delay=2)
         return {**constructors, "SB3 TD3 (policy_delay 2)": lambda: sb3(setting, TD3)}
-    floor = BareProducts(setting)
     return {
         **constructors,
-        "bare products": lambda: (floor.critic, floor.train),
         "separate networks": lambda: separate(setting),
         "SB3 SAC": lambda: sb3(setting, n_critics=setting.n_critics),
         "SB3 SAC, our policy_delay": lambda: sb3(setting, DelayedSAC, n_critics=setting.n_critics),
