@@ -25,26 +25,6 @@ from sb3_symphony.experiment.environment import Wrappers, import_packages, make_
 from sb3_symphony.experiment.registry import LOADABLE, load_algorithm
 from sb3_symphony.experiment.select import Selection, SelectOptions, pretrained_folder, select_model
 
-#: Parts of a model that acting does not need, and what stands in for them. They hold pickles that often do not outlive
-#: a version of Python, NumPy or Stable-Baselines3, and a replay buffer of full size
-_UNUSED: dict[str, Any] = {
-    "learning_rate": 0.0,
-    "lr_schedule": lambda _: 0.0,
-    "clip_range": lambda _: 0.0,
-    "clip_range_vf": None,
-    "exploration_schedule": lambda _: 0.0,
-    "action_noise": None,
-    "replay_buffer_class": None,
-    "replay_buffer_kwargs": {},
-    "ep_info_buffer": None,
-    "ep_success_buffer": None,
-    "_last_obs": None,
-    "_last_original_obs": None,
-    "_last_episode_starts": None,
-    "tensorboard_log": None,
-    "verbose": 0,
-}
-
 
 class Step(NamedTuple):
     """
@@ -203,6 +183,19 @@ def _tell_of_pickles() -> None:
     )
 
 
+def _substitutes() -> dict[str, Any]:
+    """
+    What stands in for parts of a model that acting does not need. They hold pickles that often do not outlive a version of
+    Python, NumPy or Stable-Baselines3, and make a replay buffer of full size. Made anew each time, as SB3 changes them.
+    """
+    substitutes: dict[str, Any] = {"learning_rate": 0.0, "replay_buffer_kwargs": {}, "verbose": 0}
+    substitutes.update(dict.fromkeys(("lr_schedule", "clip_range", "exploration_schedule"), lambda _: 0.0))
+    substitutes.update(dict.fromkeys(("ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs")))
+    substitutes.update(dict.fromkeys(("_last_episode_starts", "_last_lstm_states", "clip_range_vf", "tensorboard_log")))
+    substitutes.update(dict.fromkeys(("action_noise", "replay_buffer_class")))
+    return substitutes
+
+
 def load_model(selection: Selection, device: str = "auto") -> BaseAlgorithm:
     """
     Load a model to act with; what only training needs is left out, so it cannot go on learning.
@@ -219,7 +212,8 @@ def load_model(selection: Selection, device: str = "auto") -> BaseAlgorithm:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*n_steps.*")  # SB3's, about the replay that is left out
-            return algorithm.load(selection.model, device=device, custom_objects=_UNUSED, buffer_size=1)
+            warnings.simplefilter("ignore", DeprecationWarning)  # of old pickles
+            return algorithm.load(selection.model, device=device, custom_objects=_substitutes(), buffer_size=1)
     except Exception as error:  # a pickle can fail in any way
         raise ConfigError(f"{selection.model}: cannot be loaded as a model of {selection.algo} — {_told(error)}") from error
 
@@ -246,12 +240,16 @@ def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None
         owners = [name for name in LOADABLE if policy in policies(load_algorithm(name))]
         if owners:  # else a policy of somebody's own
             raise ConfigError(f"{path}: not a model of {selection.algo} — its policy is that of {' or '.join(owners)}")
-    # Kept by SB3 where observations or rewards were normalised
-    if data.get("_last_original_obs") is not None and not selection.normalization_known:
+    if selection.normalization_known:
+        return
+    # On-policy, SB3 keeps this where observations or rewards were normalised; off-policy it always does
+    if data.get("_last_original_obs") is not None and "replay_buffer_class" not in data:
         raise ConfigError(
             f"{path}: was trained with VecNormalize — expected its statistics as --vecnormalize FILE, or "
             "--vecnormalize none if only rewards were normalised"
         )
+    for statistics in sorted(path.parent.glob("*vec*normalize*.pkl")):
+        print(f"note: {statistics} lies beside the model, --vecnormalize would use it", file=sys.stderr)
 
 
 def _fits(model: spaces.Space, env: spaces.Space, exact: bool) -> bool:

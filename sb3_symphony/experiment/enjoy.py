@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.environment import attach_monitor_files
+from sb3_symphony.experiment.output import output_folder
 from sb3_symphony.experiment.select import EnjoyOptions
 
 
@@ -96,10 +97,4 @@ def _log_folder(name: str, n_envs: int) -> Path:
     for index in range(n_envs):
         if (folder / f"{index}.monitor.csv").exists():
             raise ConfigError(f"--reward-log: '{name}' has a {index}.monitor.csv already, which is left alone")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / ".writable").touch()
-        (folder / ".writable").unlink()
-    except OSError as error:
-        raise ConfigError(f"--reward-log: '{name}' cannot be written — {error.strerror}") from None
-    return folder
+    return output_folder(name, "--reward-log")

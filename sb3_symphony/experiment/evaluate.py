@@ -4,13 +4,11 @@ import contextlib
 import io
 import json
 import multiprocessing
-import os
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +16,9 @@ from rich.console import Console
 from rich.progress import track
 
 from sb3_symphony.analysis.statistics import summarise
-from sb3_symphony.common.checkpoint import write_atomically
 from sb3_symphony.experiment.agent import Agent, open_agent
-from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.environment import Wrappers
+from sb3_symphony.experiment.output import output_file, write_output
 from sb3_symphony.experiment.robustness import ActionDelay, ObservationNoise
 from sb3_symphony.experiment.select import EvaluateOptions, Selection
 
@@ -111,7 +108,7 @@ def evaluate(options: EvaluateOptions) -> Evaluation:
     :return: the episodes and their statistics; written as JSON too, if the options name a file
     :raises ConfigError: if something is missing or damaged, does not fit, or cannot be written
     """
-    target = _writable(options.json_file)
+    target = None if options.json_file in (None, "-") else output_file(options.json_file, "--json")
     with _open(options) as agent:  # here too with several processes: mistakes are found before they start
         seeds = range(options.seed, options.seed + options.n_episodes)
         played = _in_processes(options, seeds) if min(options.n_envs, len(seeds)) > 1 else _in_turn(agent, options, seeds)
@@ -120,10 +117,7 @@ def evaluate(options: EvaluateOptions) -> Evaluation:
         )
         result = Evaluation(agent.selection, options, list(bar(played, total=len(seeds))))
     if target is not None:
-        try:
-            write_atomically(target, result.as_json().encode())
-        except OSError as error:
-            raise ConfigError(f"--json: '{target}' cannot be written — {error.strerror}\n{result}") from None
+        write_output(target, result.as_json().encode(), "--json")
     return result
 
 
@@ -174,20 +168,3 @@ def _in_processes(options: EvaluateOptions, seeds: range) -> Iterator[Episode]:
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-
-
-def _writable(name: str | None) -> Path | None:
-    """The file, after a look whether it could be written, so that nobody waits for results in vain."""
-    if name is None or name == "-":
-        return None
-    path = Path(name)
-    problem = None
-    if path.is_dir():
-        problem = "it is a folder"
-    elif not path.parent.is_dir():
-        problem = f"there is no folder {path.parent}"
-    elif not os.access(path.parent, os.W_OK):
-        problem = f"no permission to write in {path.parent}"
-    if problem:
-        raise ConfigError(f"--json: '{name}' cannot be written — {problem}")
-    return path

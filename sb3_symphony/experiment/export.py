@@ -14,9 +14,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from torch import nn
 
-from sb3_symphony.common.checkpoint import write_atomically
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.output import output_file, write_output
 from sb3_symphony.experiment.select import ExportOptions
 
 #: observations that the file is checked on
@@ -99,18 +99,11 @@ def export(options: ExportOptions) -> Export:
         message = f'{error.name} is not installed: pip install "sb3-symphony[export]"'
         raise ConfigError(message) from None
     with open_agent(options.model_copy(update={"device": "cpu"})) as agent:
-        path = Path(options.output) if options.output else agent.selection.model.with_suffix(".onnx")
-        if path.suffix != ".onnx":
-            raise ConfigError(f"--output: '{path}' — expected a file name that ends with .onnx")
-        if not path.parent.is_dir():
-            raise ConfigError(f"--output: '{path}' cannot be written — there is no folder {path.parent}")
+        path = output_file(options.output or agent.selection.model.with_suffix(".onnx"), "--output", (".onnx",))
         _check_exportable(agent)
         content = onnx_model(agent.model, unwrap_vec_normalize(agent.env), _properties(agent))
         difference = _difference(content, agent)
-    try:
-        write_atomically(path, content)
-    except OSError as error:
-        raise ConfigError(f"--output: '{path}' cannot be written — {error.strerror}") from None
+    write_output(path, content, "--output")
     return Export(path, difference)
 
 

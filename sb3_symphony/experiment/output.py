@@ -1,0 +1,65 @@
+"""Files that a command is told to write: refused before the work begins, and written whole or not at all."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_symphony.common.checkpoint import write_atomically
+from sb3_symphony.experiment.config import ConfigError
+
+
+def output_file(name: str | Path, flag: str, suffixes: Sequence[str] = ()) -> Path:
+    """
+    Look whether a file could be written, so that nobody waits for results in vain.
+
+    :param name: the file
+    :param flag: the flag that names it, for messages
+    :param suffixes: how its name may end, such as ``.json``; empty: in any way
+    :return: the file
+    :raises ConfigError: if it could not be written
+    """
+    path = Path(name)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise ConfigError(f"{flag}: '{name}' — expected a file name that ends with {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise ConfigError(f"{flag}: '{name}' cannot be written — it is a folder")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{flag}: '{name}' cannot be written — there is no folder {path.parent}")
+    _try_to_write(path.parent, name, flag)
+    return path
+
+
+def output_folder(name: str | Path, flag: str) -> Path:
+    """
+    :param name: a folder, made if need be
+    :param flag: the flag that names it, for messages
+    :return: the folder
+    :raises ConfigError: if it cannot be made, or not be written into
+    """
+    path = Path(name)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{flag}: '{name}' cannot be written — {error.strerror}") from None
+    _try_to_write(path, name, flag)
+    return path
+
+
+def _try_to_write(folder: Path, name: str | Path, flag: str) -> None:
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise ConfigError(f"{flag}: '{name}' cannot be written — {error.strerror}") from None
+
+
+def write_output(path: Path, content: bytes, flag: str) -> None:
+    """
+    :param path: result of :func:`output_file`; a file of that name is replaced, or left alone if writing fails
+    :param content: what to write
+    :param flag: the flag that names the file, for messages
+    :raises ConfigError: if it cannot be written, because the disk is full for example
+    """
+    try:
+        write_atomically(path, content)
+    except OSError as error:
+        raise ConfigError(f"{flag}: '{path}' cannot be written — {error.strerror}") from None

@@ -1,0 +1,84 @@
+"""Files named on the command line: refused early, written whole."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.output import output_file, output_folder, write_output
+
+
+@contextmanager
+def ordinary_user() -> Iterator[None]:
+    """Permissions do not hold for root."""
+    if os.geteuid() != 0:
+        yield
+        return
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+@pytest.fixture
+def folder(monkeypatch):
+    """A folder that every user can look into; pytest's own cannot be."""
+    with tempfile.TemporaryDirectory() as name:
+        os.chmod(name, 0o755)
+        monkeypatch.chdir(name)
+        yield Path(name)
+        monkeypatch.undo()
+
+
+def test_good_names(folder):
+    assert output_file("a.json", "--json") == Path("a.json")
+    assert output_file("a.ONNX", "-o", (".onnx",)) == Path("a.ONNX")
+    assert output_folder("new/folder", "--reward-log").is_dir()
+    assert [path.name for path in folder.iterdir()] == ["new"] and not list((folder / "new" / "folder").iterdir())
+
+
+def test_bad_names(folder):
+    (folder / "file").touch()
+    for call, message in (
+        (
+            lambda: output_file("a.zip", "-o", (".onnx", ".pb")),
+            "-o: 'a.zip' — expected a file name that ends with .onnx or .pb",
+        ),
+        (lambda: output_file(".", "-o"), "-o: '.' cannot be written — it is a folder"),
+        (lambda: output_file("no/a", "-o"), "-o: 'no/a' cannot be written — there is no folder no"),
+        (lambda: output_folder("file", "-o"), "-o: 'file' cannot be written — File exists"),
+        (lambda: output_folder("file/below", "-o"), "-o: 'file/below' cannot be written — Not a directory"),
+    ):
+        with pytest.raises(ConfigError) as error:
+            call()
+        assert str(error.value) == message
+    assert [path.name for path in folder.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+def test_without_permission(folder):
+    locked = folder / "locked"
+    locked.mkdir()
+    (locked / "out.json").write_text("mine")
+    locked.chmod(0o555)
+    with ordinary_user():
+        for call in (
+            lambda: output_file("locked/out.json", "-o"),
+            lambda: output_folder("locked", "-o"),
+            lambda: output_folder("locked/new", "-o"),
+            lambda: write_output(Path("locked/out.json"), b"other", "-o"),
+        ):
+            with pytest.raises(ConfigError, match=r"-o: .locked.*. cannot be written — Permission denied"):
+                call()
+    assert (locked / "out.json").read_text() == "mine" and len(list(locked.iterdir())) == 1
+
+
+def test_writing(folder):
+    (folder / "out").write_bytes(b"before")
+    write_output(folder / "out", b"after", "-o")
+    assert (folder / "out").read_bytes() == b"after" and len(list(folder.iterdir())) == 1
