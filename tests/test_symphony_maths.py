@@ -385,3 +385,28 @@ def test_prediction_changes_nothing(pendulum):
     assert th.equal(model.baseline, baseline)
     assert all(th.equal(value, actor[name]) for name, value in model.actor.state_dict().items())
     assert th.equal(th.get_rng_state(), torch_state) and np.random.get_state()[1].tolist() == numpy_state
+
+
+# Smoothing of the target ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("noise", "clip"), [(0.0, 0.5), (0.05, 0.5), (10.0, 0.1), (0.2, 0.0), (10.0, 5.0)])
+def test_smoothed_target_actions(monkeypatch, noise, clip):
+    model, _ = model_with_data(
+        initial_gradient_steps=(0, 0), policy_delay=50, target_policy_noise=noise, target_noise_clip=clip
+    )
+    calls, values = [], model._regression.target_q_values
+    monkeypatch.setattr(model._regression, "target_q_values", lambda *args: calls.append(args) or values(*args))
+    model.train(40, 128)
+    with th.no_grad():
+        own = th.cat([model.actor(observations) for observations, _ in calls])
+    differences = th.cat([actions for _, actions in calls]) - own
+    if min(noise, clip) == 0:
+        assert differences.abs().max() < 1e-6
+    elif clip == 5:  # nearly all of them are beyond the bounds of the action space
+        assert ((own + differences).abs() > 1 - 1e-6).float().mean() > 0.8
+        assert (own + differences).abs().max() <= 1
+    elif noise == 10:  # nearly all of them are clipped
+        assert differences.abs().max() <= clip + 1e-6 and differences.abs().median().item() == pytest.approx(clip, abs=1e-6)
+    else:
+        assert differences.std().item() == pytest.approx(noise, rel=0.05) and abs(differences.mean().item()) < 0.003

@@ -55,6 +55,9 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param policy_delay: Critic updates per actor update
     :param target_mode: How the critics are combined, in the target and for the actor: ``"min"``, ``"mean"`` or ``"rem"``
     :param min_mix: Weight of the minimum, the rest is on the mean
+    :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it (as in TD3;
+        not a part of Symphony, whose sources have none)
+    :param target_noise_clip: Limit of the absolute value of that noise
     :param critic_loss: Error function of the critics: ``"rehe"``, ``"rehe_elementwise"``, ``"huber"`` or ``"mse"``
     :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
     :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
@@ -103,6 +106,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         policy_delay: int = 1,
         target_mode: str = "min",
         min_mix: float = 1.0,
+        target_policy_noise: float = 0.0,
+        target_noise_clip: float = 0.5,
         critic_loss: str = "rehe",
         actor_loss: str = "rehae",
         initial_gradient_steps: tuple[int, int] = (64, 64),
@@ -146,6 +151,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         )
         self.critic_learning_rate = critic_learning_rate
         self.min_mix = min_mix
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
         self.actor_loss = actor_loss
         self.initial_gradient_steps = initial_gradient_steps
         self.episode_gradient_steps = episode_gradient_steps
@@ -154,6 +161,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         if critic_learning_rate is not None and not callable(critic_learning_rate):
             check_number("critic_learning_rate", critic_learning_rate, 0)
         check_number("min_mix", min_mix, 0, 1)
+        check_number("target_policy_noise", target_policy_noise, 0)
+        check_number("target_noise_clip", target_noise_clip, 0)
         check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
         if not isinstance(initial_gradient_steps, (tuple, list)) or len(initial_gradient_steps) != 2:
             raise ValueError(f"initial_gradient_steps={initial_gradient_steps!r}: expected two numbers (uniform, faded)")
@@ -206,11 +215,15 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         # The actor is frozen inside a segment: one forward pass gives all its next actions
         for segment, batches in self._segments(gradient_steps, batch_size, **sample_kwargs):
             with th.no_grad():
-                next_actions = self.actor(segment.next_observations).split(batch_size)
+                next_actions = self.actor(segment.next_observations)
+                if self.target_policy_noise > 0:
+                    noise = th.randn_like(next_actions) * self.target_policy_noise
+                    noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+                    next_actions = (next_actions + noise).clamp(-1, 1)
 
-            for batch, next_action in zip(batches, next_actions, strict=True):
+            for batch, next_action in zip(batches, next_actions.split(batch_size), strict=True):
                 with th.no_grad():
-                    # The online actor, without noise; minimum over the critics: (n_critics, batch, 1) -> (batch, 1)
+                    # The online actor; minimum over the critics: (n_critics, batch, 1) -> (batch, 1)
                     next_q_values = self._regression.target_q_values(batch.next_observations, next_action)
                     next_values = combine(next_q_values, self.target_mode, self.min_mix)
                     target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
