@@ -18,7 +18,13 @@ from sb3_symphony.experiment.config import (
 )
 from sb3_symphony.experiment.plot import PlotOptions
 from sb3_symphony.experiment.registry import ALGORITHMS
-from sb3_symphony.experiment.select import EnjoyOptions, EvaluateOptions, ExportOptions, SelectOptions
+from sb3_symphony.experiment.select import (
+    EnjoyOptions,
+    EvaluateOptions,
+    ExportOptions,
+    SelectOptions,
+    VideoOptions,
+)
 
 _TRAIN_EXAMPLES = """examples:
   sb3-symphony train                                  Symphony learns to walk
@@ -41,6 +47,11 @@ _ENJOY_EXAMPLES = """examples:
 _EXPORT_EXAMPLES = """examples:
   sb3-symphony export --algo sac --env Pendulum-v1 --load-best
   sb3-symphony export --model ppo.zip --algo ppo --env Hopper-v5 --vecnormalize stats.pkl -o robot.onnx
+"""
+_VIDEO_EXAMPLES = """examples:
+  sb3-symphony video                                   the latest run of Symphony on BipedalWalker-v3
+  sb3-symphony video --algo sac --env Hopper-v5 --load-best -n 500 -o hopper.gif --width 300
+  sb3-symphony video logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 --grid -l Symphony REDQ
 """
 _PLOT_EXAMPLES = """examples:
   sb3-symphony plot                                        all runs in logs, a panel for each environment
@@ -139,9 +150,11 @@ def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     return 130 if result.interrupted else 0
 
 
-def _add_selection(parser: argparse.ArgumentParser) -> None:
-    """The flags of :class:`SelectOptions`, which all commands on trained agents share."""
+def _add_selection(parser: argparse.ArgumentParser, several: bool = False) -> None:
+    """The flags of :class:`SelectOptions`, which all commands on trained agents share; ``several`` may be given by name."""
     add = partial(parser.add_argument_group("which agent").add_argument, default=argparse.SUPPRESS)
+    if several:
+        add("agents", nargs="*", metavar="AGENT", help="model's zip file or run folder (default: found by the next flags)")
     add("--model", metavar="PATH", help="model's zip file, or a run folder (default: found by the next flags)")
     add("--algo", metavar="ALGO", help="its algorithm (default: the run's; without --model symphony)")
     add("--env", metavar="ID", help="its environment (default: the run's; without --model BipedalWalker-v3)")
@@ -260,6 +273,45 @@ def _export(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     return 0
 
 
+def _add_agents(parser: argparse.ArgumentParser, output: str) -> Any:
+    """The flags of :class:`AgentsOptions`, which commands that show agents share."""
+    _add_selection(parser, several=True)
+    add = partial(parser.add_argument, default=argparse.SUPPRESS)
+    add("-l", "--labels", nargs="+", metavar="NAME", help="what to call the agents")
+    add("-o", "--output", metavar="FILE", help=output)
+    add("-n", "--n-timesteps", type=_whole_number, metavar="N", help="leave an episode after N steps (default: at its end)")
+    add("--seed", type=_whole_number, metavar="N", help="seed of the first episode (default: 0)")
+    _add_deterministic(parser)
+    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
+    return add
+
+
+def _add_video(commands: Any) -> None:
+    parser = commands.add_parser(
+        "video",
+        help="film trained agents",
+        usage="%(prog)s [AGENT ...] [which agent] [options]",
+        description="Film episodes of trained agents, in real time of the simulated world; no display is needed.",
+        epilog=_VIDEO_EXAMPLES,
+    )
+    add = _add_agents(parser, "film, .mp4 or .gif (default: in the run's folder videos)")
+    add("--grid", action="store_true", help="all agents side by side in one film (default: a film for each)")
+    add("--n-episodes", type=_whole_number, metavar="N", help="episodes in a film; the next seeds (default: 1)")
+    add("--fps", type=_whole_number, metavar="N", help="pictures per second (default: the environment's, at most 50, GIF 25)")
+    add("--width", type=_whole_number, metavar="N", help="pixels for each agent (default: the environment's, in a grid 400)")
+    parser.set_defaults(run=_video, parser=parser)
+
+
+def _video(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    arguments.setdefault("progress", sys.stderr.isatty())
+    options = _selection(VideoOptions, arguments)
+
+    from sb3_symphony.experiment.video import video
+
+    print(*video(options), sep="\n")
+    return 0
+
+
 def _add_plot(commands: Any) -> None:
     parser = commands.add_parser(
         "plot",
@@ -331,6 +383,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands)
     _add_export(commands)
     _add_plot(commands)
+    _add_video(commands)
     _add_list(commands)
     return parser
 

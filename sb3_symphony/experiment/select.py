@@ -281,3 +281,44 @@ class ExportOptions(SelectOptions):
     """Options of ``sb3-symphony export``; their meaning is in its ``--help``."""
 
     output: str | None = None
+
+
+class AgentsOptions(SelectOptions):
+    """
+    Flags of commands that show one agent or several.
+
+    :param agents: models' zip files or run folders; none: the one that the other flags name
+    :param labels: what to call them; none: algorithm, and which of its models
+    :param seed: seed of the (first) episode
+    :param deterministic: whether the policy is asked for its mode instead of a sample
+    :param n_timesteps: an episode is left after that many steps; None: at its end
+    :param output: file to write
+    :param progress: whether to show a progress bar
+    """
+
+    agents: list[str] = []
+    labels: list[str] = []
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    deterministic: bool = True
+    n_timesteps: int | None = Field(default=None, ge=1)
+    output: str | None = None
+    progress: bool = False
+    num_threads: int = 1
+
+
+class VideoOptions(AgentsOptions):
+    """Options of ``sb3-symphony video``; their meaning is in its ``--help``."""
+
+    grid: bool = False
+    n_episodes: int = Field(default=1, ge=1)
+    fps: int | None = Field(default=None, ge=1, le=120)
+    width: int | None = Field(default=None, ge=64, le=3840)
+
+
+class GaitOptions(AgentsOptions):
+    """Options of ``sb3-symphony gait``; their meaning is in its ``--help``."""
+
+    skip: FiniteFloat = Field(default=2.0, ge=0)
+    window: FiniteFloat = Field(default=4.0, gt=0)
+    n_frames: int = Field(default=8, ge=0, le=40)
+    json_file: str | None = None

@@ -1,0 +1,250 @@
+"""Films: what is in them, and how long they are."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from PIL import Image
+from stable_baselines3 import TD3
+
+from sb3_symphony.cli import main
+from sb3_symphony.experiment.video import _Moment, labelled, sampled, side_by_side, write_film
+
+read_frames = pytest.importorskip("imageio_ffmpeg").read_frames
+
+
+class Counter(gym.Env):
+    """Its picture has the grey of the number of steps; episode of 20 steps, 10 a second, reward 1 each."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode=None, length=20):
+        self.render_mode, self.length = render_mode, length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_steps = 0
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        return np.zeros(1, dtype=np.float32), 1.0, self.n_steps == self.length, False, {}
+
+    def render(self):
+        return np.full((60, 100, 3), 10 * self.n_steps, dtype=np.uint8)
+
+
+class Blind(Counter):
+    metadata = {"render_modes": [], "render_fps": 10}  # noqa: RUF012
+
+
+for name, class_ in (("Counter-v0", Counter), ("Blind-v0", Blind)):
+    if name not in gym.registry:
+        gym.register(name, entry_point=class_, max_episode_steps=50)
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    """A model for both environments, in an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    TD3("MlpPolicy", "Counter-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}).save("agent")
+    return tmp_path / "agent.zip"
+
+
+def film_of(path):
+    """Pictures and pictures per second of an MP4."""
+    reader = read_frames(str(path))
+    facts = next(reader)
+    width, height = facts["size"]
+    return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]), facts["fps"]
+
+
+def greys(film, left=0, width=100):
+    """Mean grey of the lower half of an agent's pictures, in steps of the environment."""
+    return film[:, film.shape[1] // 2 :, left : left + width].mean(axis=(1, 2, 3)) / 10
+
+
+# ---------------------------------------------------------------- pieces
+
+
+@pytest.mark.parametrize("steps_per_second, fps, length", [(50, 50, 7), (50, 25, 7), (10, 30, 4), (125, 50, 20), (30, 7, 31)])
+def test_time_passes_as_in_the_simulated_world(steps_per_second, fps, length):
+    moments = [_Moment(np.empty(0), n, float(n), n == length) for n in range(length + 1)]
+    shown = [moment.n_steps for moment in sampled(moments, steps_per_second, fps)]
+    n_pictures = math.ceil(length * fps / steps_per_second) + 1
+    assert shown == [min(math.floor(k * steps_per_second / fps), length) for k in range(n_pictures)]
+    assert shown.count(length) == 1 or shown[-1] == length
+
+
+def test_a_line_of_text_above_the_picture():
+    picture = np.full((40, 200, 3), 128, dtype=np.uint8)
+    result = labelled(picture, "left", "right", 200)
+    assert result.shape == (40 + 22, 200, 3) and (result[22:] == 128).all()  # nothing of the picture is hidden
+    bar = result[:22].min(axis=(0, 2))
+    assert bar[:40].min() < 100 and bar[-40:].min() < 140 and bar[60:140].min() == 255
+    assert labelled(picture, "", "", 100).shape == (20 + 22, 100, 3)
+
+
+def test_side_by_side():
+    tiles = [np.full((10, 8, 3), k, dtype=np.uint8) for k in range(4)]
+    three, four = side_by_side(tiles[:3]), side_by_side(tiles)
+    assert three.shape == (10, 3 * 8 + 2 * 4, 3) and four.shape == (24, 20, 3)
+    assert [four[0, 0, 0], four[0, -1, 0], four[-1, 0, 0], four[-1, -1, 0]] == [0, 1, 2, 3]
+    assert side_by_side([tiles[0], tiles[1][:5]])[9, 15, 0] == 255
+
+
+def test_a_film_that_fails_leaves_the_old_one(tmp_path):
+    for name in ("a.mp4", "a.gif"):
+        path = tmp_path / name
+        path.write_text("old")
+
+        def broken():
+            yield np.zeros((16, 16, 3), dtype=np.uint8)
+            raise RuntimeError("no more")
+
+        with pytest.raises(RuntimeError):
+            write_film(broken(), 10, path)
+        assert path.read_text() == "old"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.mp4"]
+
+
+# ---------------------------------------------------------------- films
+
+
+def test_mp4(model, capsys):
+    assert main(["video", "--model", "agent", "--algo", "td3", "--env", "Counter-v0", "--no-progress"]) == 0
+    assert capsys.readouterr().out == "agent.mp4\n"
+    film, fps = film_of("agent.mp4")
+    assert fps == 10 and len(film) == 21 + 10  # before the first step, after each, and a second at the end
+    assert film.shape[1:] == (82, 100, 3)
+    np.testing.assert_allclose(greys(film), [*range(21), *[20] * 10], atol=0.2)
+
+
+def test_episodes_steps_rate_and_size(model):
+    argv = "video agent.zip --algo td3 --env Counter-v0 --n-episodes 2 -n 5 --fps 20 --width 201 -o a.mp4 --no-progress"
+    assert main(argv.split()) == 0
+    film, fps = film_of("a.mp4")
+    assert fps == 20 and film.shape[2] == 202  # H.264 wants an even number
+    once = [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5] + [5] * 20
+    np.testing.assert_allclose(greys(film, width=180), once * 2, atol=0.4)
+
+
+def test_gif(model):
+    assert main("video agent.zip --algo td3 --env Counter-v0 -n 4 -o a.gif --no-progress".split()) == 0
+    with Image.open("a.gif") as film:
+        total = 0
+        for index in range(film.n_frames):
+            film.seek(index)
+            total += film.info["duration"]
+            assert np.asarray(film.convert("RGB"))[60, 50, 0] == 10 * index
+        assert film.n_frames == 5 and film.info["loop"] == 0  # equal pictures are one, shown longer
+    assert total == 1500
+
+
+def test_grid(model):
+    argv = [
+        "video",
+        "agent.zip",
+        "agent.zip",
+        "--algo",
+        "td3",
+        "--env",
+        "Counter-v0",
+        "--grid",
+        "--no-progress",
+        "--width",
+        "100",
+    ]
+    assert main(argv) == 0
+    film, _ = film_of("Counter-v0_grid.mp4")
+    assert film.shape[2] == 204
+    np.testing.assert_allclose(greys(film), greys(film, left=104), atol=0.2)
+
+
+def test_who_has_finished_waits(model, monkeypatch):
+    from sb3_symphony.experiment import video
+
+    lengths = iter((3, 6))
+    original = video.open_agent
+
+    def of_different_length(options, **kwargs):
+        return original(options.model_copy(update={"env_kwargs": {"length": next(lengths)}}), **kwargs)
+
+    monkeypatch.setattr(video, "open_agent", of_different_length)
+    argv = "video agent agent --algo td3 --env Counter-v0 --grid -o a.mp4 --no-progress --width 100 -l short long"
+    assert main(argv.split()) == 0
+    film, _ = film_of("a.mp4")
+    np.testing.assert_allclose(greys(film), [0, 1, 2, 3, 3, 3, 3] + [3] * 10, atol=0.2)
+    np.testing.assert_allclose(greys(film, left=104), [0, 1, 2, 3, 4, 5, 6] + [6] * 10, atol=0.2)
+
+
+def test_a_run_keeps_its_films(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    argv = "train --algo td3 --env Pendulum-v1 -n 60 --eval-freq 0 --no-progress --verbose 0 --seed 0 --save-freq 50"
+    assert main([*argv.split(), "-params", "buffer_size:100"]) == 0
+    capsys.readouterr()
+    assert main("video --algo td3 --env Pendulum-v1 --load-checkpoint 50 -n 10 --no-progress".split()) == 0
+    out = capsys.readouterr().out.strip()
+    assert out == "logs/td3/Pendulum-v1_1/videos/rl_model_50_steps.mp4"
+    assert len(film_of(out)[0]) == 11 + 30
+
+
+def test_mujoco(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    TD3("MlpPolicy", "Hopper-v5", buffer_size=10, policy_kwargs={"net_arch": [4]}).save("agent")
+    try:
+        status = main("video agent --algo td3 --env Hopper-v5 -n 5 -o a.gif --no-progress".split())
+    finally:
+        import os
+
+        assert "MUJOCO_GL" not in os.environ
+    if status == 2:
+        pytest.skip("no EGL on this machine")
+    with Image.open("a.gif") as film:
+        assert np.asarray(film.convert("RGB")).std() > 20
+
+
+# ---------------------------------------------------------------- mistakes
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ("-o a.avi", "expected a file name that ends with .mp4 or .gif"),
+        ("-o nowhere/a.mp4", "there is no folder nowhere"),
+        ("--fps 0", "fps: 0"),
+        ("--width 10", "width: 10"),
+        ("-n 0", "n_timesteps: 0"),
+        ("--n-episodes 0", "n_episodes: 0"),
+        ("--labels a b", "--labels: 2 given — expected 1"),
+        ("agent.zip -o a.mp4", "2 agents give 2 files, see --grid"),
+        ("nothing.zip", "nothing.zip: no such file"),
+        ("--model agent.zip", "expected either --model or agent.zip, not both"),
+        ("--env Blind-v0", "Blind-v0: draws no pictures"),
+        ("--grd", "did you mean '--grid'?"),
+    ],
+)
+def test_mistakes(model, capsys, arguments, message):
+    before = sorted(model.parent.rglob("*"))
+    env = [] if "--env" in arguments else ["--env", "Counter-v0"]
+    try:
+        status = main(["video", "agent.zip", *arguments.split(), "--algo", "td3", *env, "--no-progress"])
+    except SystemExit as error:
+        status = error.code
+    errors = capsys.readouterr().err.splitlines()
+    assert status == 2 and message in errors[-1]
+    assert len([line for line in errors if not line.startswith("note:")]) == 1
+    assert sorted(model.parent.rglob("*")) == before
+
+
+def test_mp4_without_its_library(model, capsys, monkeypatch):
+    monkeypatch.setattr("sb3_symphony.experiment.video.find_spec", lambda name: None)
+    argv = "video agent --algo td3 --env Counter-v0 -n 2 --no-progress -o".split()
+    assert main([*argv, "a.mp4"]) == 2
+    assert 'pip install "sb3-symphony[video]"' in capsys.readouterr().err
+    assert main([*argv, "a.gif"]) == 0
