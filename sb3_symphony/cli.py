@@ -92,8 +92,11 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 def _whole_number(text: str) -> int:
     """``1e6`` is what one types for a million."""
-    number = float(text)
-    if number != int(number):
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text)
+    if not number.is_integer():  # nor are infinity and nan
         raise ValueError
     return int(number)
 
