@@ -323,7 +323,7 @@ def _entry(options: TrainOptions) -> dict[str, Any]:
         if name in content:
             if not isinstance(content[name], dict):
                 raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")
-            return deepcopy(content[name])
+            return content[name]
     if content and all(isinstance(value, dict) and "n_timesteps" in value for value in content.values()):
         raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     return content
@@ -373,7 +373,19 @@ def load_config(options: TrainOptions) -> RunConfig:
     :raises ConfigError: if a file or a key of the run is wrong
     """
     check_algorithm(options.algo)
-    plain = _entry(options)
+    return merge(_entry(options), options)
+
+
+def merge(entry: dict[str, Any], options: TrainOptions) -> RunConfig:
+    """
+    Merge an entry of a file with the command line, later ones winning.
+
+    :param entry: plain values
+    :param options: options of the command line
+    :return: the configuration, of which the algorithm's keys are yet to be checked
+    :raises ConfigError: if a key of the run is wrong
+    """
+    plain = deepcopy(entry)
     _read_expressions(plain)  # before, so that items of them can be overridden
     for key, value in options.hyperparams.items():
         _override(plain, key, value)
