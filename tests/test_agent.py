@@ -2,14 +2,16 @@
 
 import json
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import PPO, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from sb3_symphony.experiment import agent as agent_module
@@ -57,7 +59,8 @@ class Points(gym.Env):
         return self.observation_space.sample(), 1.0, False, self.steps == 5, {}
 
 
-for name, env_class in (("AgentImages-v0", Images), ("AgentPoints-v0", Points)):
+Bits = partial(BitFlippingEnv, 3, continuous=True)
+for name, env_class in (("AgentImages-v0", Images), ("AgentPoints-v0", Points), ("AgentBits-v0", Bits)):
     if name not in gym.registry:
         gym.register(name, entry_point=env_class)
 
@@ -178,7 +181,17 @@ def test_images(algo):
     assert np.array_equal(first.action, model.predict(first.observation, deterministic=True)[0])
 
 
-def test_dict_observations_and_hindsight_replay():
+def test_hindsight_replay():
+    kwargs = {"replay_buffer_class": HerReplayBuffer, "learning_starts": 20, "policy_kwargs": {"net_arch": [8]}}
+    model = TD3("MultiInputPolicy", BitFlippingEnv(3, continuous=True), buffer_size=100, device="cpu", **kwargs).learn(30)
+    model.save("td3")
+    with open_agent(options("td3", "AgentBits-v0")) as agent:
+        steps = list(agent.episode(1))
+    assert len(steps) <= 3 and set(steps[0].observation) == {"observation", "achieved_goal", "desired_goal"}
+    assert np.array_equal(steps[0].action, model.predict(steps[0].observation, deterministic=True)[0])
+
+
+def test_dict_observations():
     model = saved("td3", "AgentPoints-v0", "MultiInputPolicy", policy_kwargs={"net_arch": [8]}, buffer_size=10)
     with open_agent(options("td3", "AgentPoints-v0")) as agent:
         steps = list(agent.episode(1))
@@ -336,6 +349,7 @@ def test_other_mistakes(folder):
     for changes, message in (
         ({"gym_packages": ["no_such_module"]}, "--gym-packages: 'no_such_module' cannot be imported"),
         ({"device": "quantum"}, "--device: 'quantum' is not there"),
+        ({"device": "meta"}, "--device: 'meta' is not there"),
         ({"env": "Pendulum-v9"}, "did you mean 'Pendulum-v1'"),
         ({"env_kwargs": {"gravity": 1}}, "gravity"),
     ):

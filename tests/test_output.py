@@ -50,7 +50,9 @@ def test_bad_names(folder):
             "-o: 'a.zip' — expected a file name that ends with .onnx or .pb",
         ),
         (lambda: output_file(".", "-o"), "-o: '.' cannot be written — it is a folder"),
+        (lambda: output_file("new/", "-o"), "-o: 'new/' cannot be written — it is a folder"),
         (lambda: output_file("no/a", "-o"), "-o: 'no/a' cannot be written — there is no folder no"),
+        (lambda: output_file("a" * 300, "-o"), f"-o: '{'a' * 300}' cannot be written — File name too long"),
         (lambda: output_folder("file", "-o"), "-o: 'file' cannot be written — File exists"),
         (lambda: output_folder("file/below", "-o"), "-o: 'file/below' cannot be written — Not a directory"),
     ):

@@ -177,6 +177,11 @@ def test_no_such_run(folder):
     fails("Broken-v0_1: not a run folder — Broken-v0/config.yml is missing", algo="sac", env="Broken-v0")
 
 
+def test_a_name_that_is_too_long():
+    fails("File name too long", model="a" * 300, algo="sac", env="Pendulum-v1")
+    fails("File name too long", folder="a" * 300)
+
+
 @pytest.mark.parametrize(
     "name, content, message",
     [

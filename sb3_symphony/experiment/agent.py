@@ -124,14 +124,13 @@ def open_agent(
 def check_device(name: str) -> None:
     """
     :param name: name of a device
-    :raises ConfigError: if torch has none of that name here
+    :raises ConfigError: if torch cannot calculate on it here
     """
     try:
-        device = "cpu" if name == "auto" else th.device(name).type
-    except RuntimeError:
-        device = ""
-    if not device or (device == "cuda" and not th.cuda.is_available()):
-        raise ConfigError(f"--device: '{name}' is not there — expected auto, cpu" + ", cuda" * th.cuda.is_available())
+        th.zeros(1, device="cpu" if name == "auto" else name).item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        known = "auto, cpu" + ", cuda" * th.cuda.is_available()
+        raise ConfigError(f"--device: '{name}' is not there — expected {known}") from None
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
 from torch import nn
 
-from sb3_symphony.experiment.agent import Agent, open_agent
+from sb3_symphony.experiment.agent import Agent, check_device, open_agent
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.output import output_file, write_output
 from sb3_symphony.experiment.select import ExportOptions
@@ -98,6 +98,7 @@ def export(options: ExportOptions) -> Export:
     except ImportError as error:
         message = f'{error.name} is not installed: pip install "sb3-symphony[export]"'
         raise ConfigError(message) from None
+    check_device(options.device)  # though tracing goes on on the CPU
     with open_agent(options.model_copy(update={"device": "cpu"})) as agent:
         path = output_file(options.output or agent.selection.model.with_suffix(".onnx"), "--output", (".onnx",))
         _check_exportable(agent)

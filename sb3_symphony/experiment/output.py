@@ -1,5 +1,6 @@
 """Files that a command is told to write: refused before the work begins, and written whole or not at all."""
 
+import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,10 +22,16 @@ def output_file(name: str | Path, flag: str, suffixes: Sequence[str] = ()) -> Pa
     path = Path(name)
     if suffixes and path.suffix.lower() not in suffixes:
         raise ConfigError(f"{flag}: '{name}' — expected a file name that ends with {' or '.join(suffixes)}")
-    if path.is_dir():
-        raise ConfigError(f"{flag}: '{name}' cannot be written — it is a folder")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{flag}: '{name}' cannot be written — there is no folder {path.parent}")
+    problem = None
+    try:
+        if path.is_dir() or str(name).endswith(("/", os.sep)):
+            problem = "it is a folder"
+        elif not path.parent.is_dir():
+            problem = f"there is no folder {path.parent}"
+    except OSError as error:  # such as a name that is too long
+        problem = error.strerror
+    if problem:
+        raise ConfigError(f"{flag}: '{name}' cannot be written — {problem}")
     _try_to_write(path.parent, name, flag)
     return path
 

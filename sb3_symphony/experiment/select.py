@@ -97,6 +97,13 @@ def select_model(options: SelectOptions) -> Selection:
     :return: the agent's files and environment
     :raises ConfigError: if there is no such agent, or its environment is not known
     """
+    try:
+        return _select(options)
+    except OSError as error:  # no permission to look, or a name that is no name
+        raise ConfigError(f"{error.filename}: cannot be read — {error.strerror}") from None
+
+
+def _select(options: SelectOptions) -> Selection:
     wanted = {
         "--load-best": options.load_best,
         "--load-checkpoint": options.load_checkpoint is not None,
