@@ -123,6 +123,8 @@ def _add_train(commands: Any) -> None:
     every, episodes = f"(default: {default.eval_freq})", f"(default: {default.eval_episodes})"
     add("--eval-freq", type=_whole_number, metavar="N", help=f"steps between evaluations, 0: none {every}")
     add("--eval-episodes", type=_whole_number, metavar="N", help=f"episodes of an evaluation {episodes}")
+    add("--protocol", metavar="P", choices=("standard",), help="evaluate as all published tables do: standard")
+    add("--threshold", type=float, metavar="R", help="return that solves it, for --protocol (default: as registered)")
     add("-params", "--hyperparams", nargs="+", metavar="K:V", help="override hyper-parameters; values are YAML")
     add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset to use, e.g. symphony-original (default: shipped)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")

@@ -21,6 +21,8 @@ from rich.progress import (
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_symphony.analysis.statistics import first_stable_evaluation
+
 
 class StopOnSignal(BaseCallback):
     """
@@ -100,12 +102,27 @@ class SeededEvaluation(EvalCallback):
 
     :param eval_env: environment of :func:`sb3_symphony.experiment.environment.make_evaluation_env`
     :param stop: tells whether to stop
+    :param threshold: mean return that two consecutive evaluations must reach for the environment to be solved
+    :param solved_stride: from then on only every n-th evaluation takes place
     :param kwargs: arguments of ``EvalCallback``
     """
 
-    def __init__(self, eval_env: VecEnv, stop: StopOnSignal, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        stop: StopOnSignal,
+        threshold: float | None = None,
+        solved_stride: int = 1,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(eval_env, **kwargs)
         self.stop = stop
+        self.threshold = threshold
+        self.solved_stride = solved_stride
+
+    def _solved(self) -> bool:
+        steps, results = self.evaluations_timesteps, self.evaluations_results
+        return self.threshold is not None and first_stable_evaluation(steps, results, self.threshold).reached
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
         if self.stop.now:
@@ -114,6 +131,8 @@ class SeededEvaluation(EvalCallback):
 
     def _on_step(self) -> bool:
         if self.eval_freq > 0 and self.n_calls % self.eval_freq == 0:
+            if self.n_calls // self.eval_freq % self.solved_stride and self._solved():
+                return True
             self.eval_env.env_method("restart_seeds")
         try:
             return super()._on_step()

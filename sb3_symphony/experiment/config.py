@@ -184,6 +184,8 @@ class TrainOptions(BaseModel):
     log_folder: str = "logs"
     eval_freq: int = 10_000
     eval_episodes: int = Field(default=10, ge=1)
+    protocol: Literal["standard"] | None = None
+    threshold: FiniteFloat | None = None
     hyperparams: dict[str, Any] = {}
     conf_file: str | None = None
     env_kwargs: dict[str, Any] = {}

@@ -23,25 +23,28 @@ class RunFolder:
     env_name: str
 
     @classmethod
-    def create(cls, log_folder: str, algo: str, env_id: str) -> "RunFolder":
+    def create(cls, log_folder: str, algo: str, env_id: str, path: Path | None = None) -> "RunFolder":
         """
         Make the next free folder; an existing one is never used again, also if two runs start at the same moment.
 
         :param log_folder: where runs are kept
         :param algo: name of the algorithm
         :param env_id: id of the environment
+        :param path: the new folder itself, instead of the next free one
         :return: the new folder
         :raises ConfigError: if it cannot be written
         """
         env_name = cls.file_name(env_id)
-        parent = Path(log_folder) / algo
+        parent = Path(log_folder) / algo if path is None else path.parent
         try:
             parent.mkdir(parents=True, exist_ok=True)
             while True:
-                run = cls(parent / f"{env_name}_{1 + max(cls.numbers(parent, env_name), default=0)}", env_name)
+                run = cls(path or parent / f"{env_name}_{1 + max(cls.numbers(parent, env_name), default=0)}", env_name)
                 try:
                     run.path.mkdir()
                 except FileExistsError:
+                    if path is not None:
+                        raise
                     continue
                 run.details.mkdir()
                 return run

@@ -33,6 +33,7 @@ from sb3_symphony.experiment.environment import (
     make_evaluation_env,
     make_training_env,
 )
+from sb3_symphony.experiment.protocol import keep_protocol, solved_stride
 from sb3_symphony.experiment.registry import load_algorithm
 from sb3_symphony.experiment.resume import continue_logs, open_run, restore_files
 from sb3_symphony.experiment.run_folder import RunFolder
@@ -116,6 +117,8 @@ def _evaluation(
     return SeededEvaluation(
         env,
         stop,
+        options.threshold,
+        solved_stride(options),
         callback_on_new_best=SaveNormalization(run.best_normalization),
         n_eval_episodes=options.eval_episodes,
         eval_freq=max(options.eval_freq // config.settings.n_envs, 1),
@@ -181,7 +184,7 @@ def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     write_atomically(run.model, content.getvalue())
 
 
-def train(options: TrainOptions, command: str | None = None) -> TrainResult:
+def train(options: TrainOptions, command: str | None = None, folder: Path | None = None) -> TrainResult:
     """
     Train one agent and write its run folder, or go on with a run that was stopped.
 
@@ -189,12 +192,13 @@ def train(options: TrainOptions, command: str | None = None) -> TrainResult:
 
     :param options: options of the command line; with ``resume`` set, only those that were given
     :param command: the command line, for ``command.txt``
+    :param folder: run folder to make instead of the next free one
     :return: what the run left behind
     :raises ConfigError: if options or configuration are wrong
     """
     with ExitStack() as cleanup:
         if options.resume is None:
-            return _train(options, load_config(options), command, cleanup)
+            return _train(options, load_config(options), command, cleanup, folder=folder)
         stored = open_run(options)
         if stored.finished:
             return TrainResult(stored.run, stored.steps, [], 0.0, untouched=True)
@@ -209,6 +213,7 @@ def _train(
     cleanup: ExitStack,
     run: RunFolder | None = None,
     checkpoint: Checkpoint | None = None,
+    folder: Path | None = None,
 ) -> TrainResult:
     seed = options.seed if options.seed >= 0 else int(np.random.default_rng().integers(2**31))
     verbose = options.verbose if options.verbose is not None else int(not options.progress)
@@ -219,6 +224,7 @@ def _train(
     env = model.get_env()
     assert env is not None
     cleanup.callback(env.close)
+    options = keep_protocol(options, config)
     evaluation_env = make_evaluation_env(options.env, config.settings) if options.eval_freq > 0 else None
     if evaluation_env is not None:
         cleanup.callback(evaluation_env.close)
@@ -229,7 +235,7 @@ def _train(
     command = command or f"sb3-symphony train --algo {options.algo} --env {shlex.quote(options.env)}"
     beginning = ""
     if run is None:
-        run = RunFolder.create(options.log_folder, options.algo, options.env)
+        run = RunFolder.create(options.log_folder, options.algo, options.env, folder)
         if options.save_freq > 0:
             run.checkpoints.mkdir()
             cleanup.enter_context(_alone(run))
