@@ -22,6 +22,7 @@ from sb3_symphony.experiment.select import (
     EnjoyOptions,
     EvaluateOptions,
     ExportOptions,
+    GaitOptions,
     SelectOptions,
     VideoOptions,
 )
@@ -52,6 +53,10 @@ _VIDEO_EXAMPLES = """examples:
   sb3-symphony video                                   the latest run of Symphony on BipedalWalker-v3
   sb3-symphony video --algo sac --env Hopper-v5 --load-best -n 500 -o hopper.gif --width 300
   sb3-symphony video logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 --grid -l Symphony REDQ
+"""
+_GAIT_EXAMPLES = """examples:
+  sb3-symphony gait                                    the latest run of Symphony on BipedalWalker-v3
+  sb3-symphony gait logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 -l Symphony REDQ -o gaits.svg
 """
 _PLOT_EXAMPLES = """examples:
   sb3-symphony plot                                        all runs in logs, a panel for each environment
@@ -317,6 +322,32 @@ def _video(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     return 0
 
 
+def _add_gait(commands: Any) -> None:
+    parser = commands.add_parser(
+        "gait",
+        help="draw and measure how trained agents walk (BipedalWalker)",
+        usage="%(prog)s [AGENT ...] [which agent] [options]",
+        description="Measure an episode of BipedalWalker: cadence, duty factor, symmetry; draw foot contact and joint angles.",
+        epilog=_GAIT_EXAMPLES,
+    )
+    add = _add_agents(parser, ".png, .svg or .pdf (default: gait.png in the run's folder)")
+    add("--skip", type=float, metavar="S", help="seconds of the episode that are left out at its beginning (default: 2)")
+    add("--window", type=float, metavar="S", help="seconds that are drawn; numbers are of all that follow (default: 2)")
+    add("--n-frames", type=_whole_number, metavar="N", help="pictures in the strip (default: 8)")
+    add("--json", dest="json_file", metavar="OUT", help="write the numbers as JSON; -: print them so")
+    parser.set_defaults(run=_gait, parser=parser)
+
+
+def _gait(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    arguments.setdefault("progress", sys.stderr.isatty())
+    options = _selection(GaitOptions, arguments)
+
+    from sb3_symphony.experiment.gait import gait
+
+    gait(options)
+    return 0
+
+
 def _add_plot(commands: Any) -> None:
     parser = commands.add_parser(
         "plot",
@@ -389,6 +420,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_export(commands)
     _add_plot(commands)
     _add_video(commands)
+    _add_gait(commands)
     _add_list(commands)
     return parser
 

@@ -326,6 +326,6 @@ class GaitOptions(AgentsOptions):
     """Options of ``sb3-symphony gait``; their meaning is in its ``--help``."""
 
     skip: FiniteFloat = Field(default=2.0, ge=0)
-    window: FiniteFloat = Field(default=4.0, gt=0)
+    window: FiniteFloat = Field(default=2.0, ge=0.2)
     n_frames: int = Field(default=8, ge=0, le=40)
     json_file: str | None = None

@@ -124,12 +124,13 @@ def _without_display() -> Iterator[None]:
             del os.environ[name]
 
 
-def show_agents(options: AgentsOptions, cleanup: ExitStack) -> list[Shown]:
+def show_agents(options: AgentsOptions, cleanup: ExitStack, camera_class: type[Camera] = Camera) -> list[Shown]:
     """
     Open the agents that are to be seen, each with a camera.
 
     :param options: which agents
     :param cleanup: closes their environments
+    :param camera_class: the camera's class
     :return: the agents, whose labels differ
     :raises ConfigError: if one of them cannot be opened
     """
@@ -142,7 +143,7 @@ def show_agents(options: AgentsOptions, cleanup: ExitStack) -> list[Shown]:
         cameras: list[Camera] = []
 
         def with_camera(env: gym.Env, cameras: list[Camera] = cameras) -> gym.Env:
-            cameras.append(Camera(env))
+            cameras.append(camera_class(env))
             return cameras[0]
 
         which = SelectOptions(**{**options.model_dump(include=set(SelectOptions.model_fields)), "model": model})
