@@ -77,22 +77,23 @@ def parse_yaml(text: str, origin: str) -> Any:
         raise ConfigError(f"{origin}: not valid YAML — {error}") from None
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, what: str = "hyper-parameters") -> dict[str, Any]:
     """
     Read a YAML file that holds a mapping.
 
     :param path: the file
+    :param what: what it describes, for messages
     :return: the mapping
     :raises ConfigError: if it cannot be read, is damaged, or is something else
     """
     try:
         content = parse_yaml(path.read_text(encoding="utf-8"), str(path))
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file — expected a YAML file of hyper-parameters") from None
+        raise ConfigError(f"{path}: no such file — expected a YAML file of {what}") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read — {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not a text file — expected a YAML file of hyper-parameters") from None
+        raise ConfigError(f"{path}: not a text file — expected a YAML file of {what}") from None
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise ConfigError(f"{path}: expected a mapping of names to values")
     return content
@@ -295,6 +296,9 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
             raise ConfigError(f"{key}: missing — expected in the configuration") from None
         if first["type"] == "extra_forbidden":
             raise ConfigError(f"unknown option '{key}'{suggestion(key, model.model_fields)}") from None
+        cause = first.get("ctx", {}).get("error")
+        if isinstance(cause, ConfigError):  # from a part that is validated by itself
+            raise ConfigError(f"{key}: {cause}") from None
         message = (
             first["msg"].removeprefix("Value error, ").partition(", unable to")[0].replace("Input should be", "expected", 1)
         )
