@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_symphony import REDQ, DroQ, Symphony
+from sb3_symphony.cli import main
 from sb3_symphony.common.callbacks import QBiasCallback, monte_carlo_returns, q_bias
 
 ALGORITHMS = [TD3, DDPG, SAC, TQC, CrossQ, Symphony, REDQ, DroQ]
@@ -272,3 +273,67 @@ def test_mistakes():
             QBiasCallback(Chain(), **{argument: 0})
     with pytest.raises(TypeError, match="n_pairs='many'"):
         q_bias(small(TD3, Chain()), Chain(), n_pairs="many")
+
+
+# ---------------------------------------------------------------- in a configuration
+
+
+def train(*arguments):
+    argv = "train --env Pendulum-v1 -n 80 --eval-freq 0 --no-progress --verbose 0 --seed 0 -tb tb --log-interval 1".split()
+    return main([*argv, *arguments])
+
+
+SMALL = ["-params", "learning_starts:20", "buffer_size:200", "batch_size:8", "policy_kwargs:{net_arch: [8]}"]
+
+
+def test_from_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    wrapper = "env_wrapper:{sb3_symphony.common.wrappers.RewardScale: {scale: 0.001}}"
+    callback = "callback:{QBiasCallback: {eval_freq: 40, n_pairs: 50, max_episode_steps: 50}}"
+    assert train("--algo", "td3", *SMALL, wrapper, "normalize:{norm_reward: false}", callback) == 0
+    events = EventAccumulator(str(tmp_path / "tb" / "Pendulum-v1" / "TD3_1")).Reload()
+    assert [event.step for event in events.Scalars("q_bias/normalized_mean")] == [40, 80]
+    returns = [event.value for event in events.Scalars("q_bias/mean_return")]
+    assert -1.7 < min(returns) and max(returns) < 0  # of the scaled rewards, which are learned from
+    assert train("--algo", "td3", *SMALL, wrapper, "normalize:{norm_reward: false}") == 0
+    with_bias, without = (TD3.load(tmp_path / f"logs/td3/Pendulum-v1_{k}/Pendulum-v1.zip").policy.state_dict() for k in (1, 2))
+    assert all(th.equal(with_bias[name], without[name]) for name in without)
+
+
+def test_callbacks_of_sb3_by_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    callback = "callback:[{stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes: {max_episodes: 1}}]"
+    stop = "{StopTrainingOnMaxEpisodes: {max_episodes: 2}}"
+    yaml = f"{{n_timesteps: 900, buffer_size: 300, policy_kwargs: {{net_arch: [8]}}, callback: {stop}}}"
+    (tmp_path / "short.yml").write_text(yaml)
+    assert train("--algo", "td3", "-conf", "short.yml", "-n", "900", "-params", callback) == 0
+    assert TD3.load(tmp_path / "logs/td3/Pendulum-v1_1/Pendulum-v1.zip").num_timesteps == 200
+    assert train("--algo", "td3", "-conf", "short.yml", "-n", "900") == 0
+    assert TD3.load(tmp_path / "logs/td3/Pendulum-v1_2/Pendulum-v1.zip").num_timesteps == 400
+
+
+@pytest.mark.parametrize(
+    "algo, value, message",
+    [
+        ("td3", "QBiasCalback", "callback: unknown class 'QBiasCalback': did you mean 'QBiasCallback'?"),
+        ("td3", "stable_baselines3.common.callbacks.CheckpointCallback", "callback: unknown class"),
+        ("td3", "os.system", "callback: unknown class"),
+        ("td3", "{QBiasCallback: {eval_frq: 10}}", "unknown argument 'eval_frq' for QBiasCallback: did you mean 'eval_freq'?"),
+        ("td3", "{QBiasCallback: {eval_freq: 0}}", "callback: QBiasCallback: eval_freq=0"),
+        ("td3", "{QBiasCallback: {eval_freq: often}}", "QBiasCallback: eval_freq: 'often' — expected a whole number"),
+        ("td3", "{QBiasCallback: {eval_env: Pendulum-v1}}", "unknown argument 'eval_env'"),
+        ("td3", "{StopTrainingOnMaxEpisodes: {}}", "max_episodes"),
+        ("td3", "5", "callback: 5 — expected a dotted name"),
+        (
+            "ppo",
+            "QBiasCallback",
+            "callback: QBiasCallback: model: expected an off-policy actor-critic such as SAC or TD3, got PPO",
+        ),
+    ],
+)
+def test_mistakes_in_a_configuration(tmp_path, monkeypatch, capsys, algo, value, message):
+    monkeypatch.chdir(tmp_path)
+    assert train("--algo", algo, "-params", f"callback:{value}", "policy_kwargs:{net_arch: [8]}") == 2
+    errors = capsys.readouterr().err
+    assert message in errors and errors.count("\n") == 1
+    assert not list(tmp_path.iterdir())

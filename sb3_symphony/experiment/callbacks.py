@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,13 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.statistics import first_stable_evaluation
+from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.decode import argument_types, class_by_name, typed_arguments
 
 
 class StopOnSignal(BaseCallback):
@@ -138,6 +141,32 @@ class SeededEvaluation(EvalCallback):
             return super()._on_step()
         except _EvaluationAborted:
             return False
+
+
+def configured_callbacks(
+    named: Iterable[tuple[str, dict[str, Any]]], model: BaseAlgorithm, make_env: Callable[[], VecEnv]
+) -> list[BaseCallback]:
+    """
+    Make the callbacks of a configuration.
+
+    :param named: names from an allow-list, and arguments
+    :param model: model that is about to learn
+    :param make_env: makes an environment with the rewards that are learned from, for callbacks that want one
+    :return: the callbacks
+    :raises ConfigError: for an unknown name, a wrong argument, or one that does not fit the model
+    """
+    callbacks: list[BaseCallback] = []
+    for name, plain in named:
+        class_ = class_by_name("callback", name)
+        arguments = typed_arguments(plain, class_, ["eval_env", "callback"])
+        if "eval_env" in argument_types(class_):
+            arguments["eval_env"] = make_env()
+        try:
+            callbacks.append(class_(**arguments))
+            callbacks[-1].init_callback(model)
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"callback: {class_.__name__}: {error}") from None
+    return callbacks
 
 
 class NoteLogFolder(BaseCallback):

@@ -213,8 +213,8 @@ class TrainOptions(BaseModel):
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _wrapper_list(value: Any) -> Any:
-    """Zoo's forms of ``env_wrapper`` (name, {name: arguments}, a list of both) as one list of (name, arguments)."""
+def _named_list(value: Any) -> Any:
+    """Zoo's forms of wrappers and callbacks (name, {name: arguments}, a list of both) as one list of (name, arguments)."""
     if value is None:
         return []
     items: list[tuple[str, dict[str, Any]]] = []
@@ -248,6 +248,7 @@ class RunSettings(BaseModel):
     :param env_wrapper: dotted names of wrappers and their arguments, from the inside out
     :param env_kwargs: arguments of the environment
     :param frame_stack: number of latest observations that the agent sees at once, by ``VecFrameStack``
+    :param callback: names of callbacks and their arguments
     :param noise_type: exploration noise of Stable-Baselines3, by Zoo's names
     :param noise_std: its standard deviation, in scaled action units
     """
@@ -258,7 +259,8 @@ class RunSettings(BaseModel):
     policy: str = "MlpPolicy"
     n_envs: _Count = 1
     normalize: bool | dict[str, Any] = False
-    env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_wrapper_list)] = []
+    env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
+    callback: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
     env_kwargs: dict[str, Any] = {}
     frame_stack: _Count | None = None
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None

@@ -42,6 +42,11 @@ _CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
     "replay_buffer_class": _BUFFERS,
     "rollout_buffer_class": _BUFFERS,
     "features_extractor_class": _EXTRACTORS,
+    # None that writes files: a configuration must not choose what is written where
+    "callback": {
+        f"{_OURS}.callbacks": ("QBiasCallback",),
+        f"{_SB3}.callbacks": ("StopTrainingOnMaxEpisodes", "LogEveryNTimesteps"),
+    },
     "action_noise": {
         f"{_SB3}.noise": ("NormalActionNoise", "OrnsteinUhlenbeckActionNoise"),
         f"{_OURS}.noise": ("DecayingNormalActionNoise", "StickyActionNoise", "PinkActionNoise", "DisturbanceActionNoise"),

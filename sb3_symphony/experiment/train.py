@@ -24,6 +24,7 @@ from sb3_symphony.experiment.callbacks import (
     SaveNormalization,
     SeededEvaluation,
     StopOnSignal,
+    configured_callbacks,
 )
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config
 from sb3_symphony.experiment.decode import algorithm_arguments
@@ -173,6 +174,18 @@ def _callbacks(
     return stop, evaluation, counting
 
 
+def _configured_callbacks(
+    options: TrainOptions, config: RunConfig, model: BaseAlgorithm, cleanup: ExitStack
+) -> list[BaseCallback]:
+    def own_env() -> VecEnv:
+        settings = config.settings.model_copy(update={"n_envs": 1})
+        env = make_training_env(options.env, settings, getattr(model, "gamma", None), seed=0)
+        cleanup.callback(env.close)
+        return env
+
+    return configured_callbacks(config.settings.callback, model, own_env)
+
+
 def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     """The model comes last and at once: a run whose model has all steps has everything."""
     normalization = model.get_vec_normalize_env()
@@ -228,6 +241,7 @@ def _train(
     evaluation_env = make_evaluation_env(options.env, config.settings) if options.eval_freq > 0 else None
     if evaluation_env is not None:
         cleanup.callback(evaluation_env.close)
+    own_callbacks = _configured_callbacks(options, config, model, cleanup)
     if options.tensorboard_log:
         _writable(options.tensorboard_log, "--tensorboard-log")
 
@@ -249,6 +263,7 @@ def _train(
     attach_monitor_files(env, run.path, append=checkpoint is not None)
 
     stop, evaluation, callbacks = _callbacks(options, config, run, evaluation_env, verbose)
+    callbacks += own_callbacks
     checkpoints = None
     if options.save_freq > 0:
         record_episodes(env)
