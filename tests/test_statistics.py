@@ -12,6 +12,7 @@ from sb3_symphony.analysis.statistics import (
     first_episode,
     first_stable_evaluation,
     iqm,
+    iqm_event,
     median_event,
     run_events,
     summarise,
@@ -194,3 +195,17 @@ def test_events_of_a_run_folder(tmp_path):
     assert events.trailing == Event(True, 1030, 103)
     assert (events.unstable, events.unstable_of) == (1, 4)
     assert (events.best_evaluation, events.best_episode) == (310.0, 301.0)
+
+
+def test_iqm_of_events():
+    # With 8 runs the two latest are cut: two censored ones do not matter for the mean, but for some bootstrap samples
+    steps, reached = [10, 20, 30, 40, 50, 60, 100, 100], [True] * 6 + [False] * 2
+    mean, low, high = iqm_event(steps, reached)
+    assert mean == (45.0, True)
+    assert low == (float(bootstrap_interval([steps])[0]), True)
+    assert high == (float(bootstrap_interval([steps])[1]), False)
+    assert iqm_event(steps, [True] * 8)[2] == (high[0], True)
+    assert iqm_event(steps, [True] * 5 + [False] * 3)[0] == (45.0, False)
+    assert iqm_event([7], [False]) == [(7.0, False)] * 3
+    with pytest.raises(ValueError):
+        iqm_event([], [])

@@ -5,7 +5,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -168,6 +168,7 @@ class Run:
     :param seed: seed, None if it is not recorded
     :param config: hyper-parameters, empty if they are not recorded as plain YAML
     :param log: folder of its TensorBoard log, None if there is none
+    :param options: options of ``train``, empty if they are not recorded as plain YAML
     """
 
     path: Path
@@ -176,6 +177,7 @@ class Run:
     seed: int | None
     config: dict[str, Any]
     log: Path | None
+    options: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
     def episodes(self) -> Episodes | None:
@@ -224,6 +226,7 @@ def open_run(folder: Path) -> Run:
         seed=options.get("seed"),
         config=config,
         log=Path(os.path.normpath(details / log.read_text(encoding="utf-8").strip())) if log.exists() else None,
+        options=options,
     )
 
 

@@ -209,6 +209,24 @@ def median_event(steps: Sequence[int], reached: Sequence[bool]) -> tuple[float, 
     return float(earliest), bool(earliest == latest)
 
 
+def iqm_event(steps: Sequence[int], reached: Sequence[bool]) -> list[tuple[float, bool]]:
+    """
+    Interquartile mean over runs of which some are censored, and its 95 % confidence interval.
+
+    :param steps: when each run reached the event, or ended
+    :param reached: whether it did
+    :return: mean, lower and upper limit, each with True; or, where it depends on what censored runs would have done, the
+        least it can be and False
+    :raises ValueError: for no runs
+    """
+    if not len(steps):
+        raise ValueError("steps: expected at least one run")
+    at = np.asarray(steps, dtype=np.float64)
+    never = np.where(np.asarray(reached, dtype=bool), at, 1e30)  # finite, so that quantiles between two of them are too
+    least, most = ([iqm(values), *bootstrap_interval([values])] for values in (at, never))
+    return [(float(low), bool(low == high)) for low, high in zip(least, most, strict=True)]
+
+
 @dataclass(frozen=True)
 class RunEvents:
     """
