@@ -264,9 +264,10 @@ def _nice_steps() -> list[float]:
 
 
 def _explained(curves: Sequence[Curve], smoothed: str) -> str:
-    several = any(len(curve.seeds) > 1 for curve in curves)
-    parts = ["bold: interquartile mean over seeds; band: its 95 % bootstrap interval; faint: single seeds"] if several else []
-    return "; ".join([*parts, smoothed] if smoothed else parts)
+    parts = [smoothed] if smoothed else []
+    if any(len(curve.seeds) > 1 for curve in curves):
+        parts.append("bold: interquartile mean over seeds, while all run; band: its 95 % bootstrap interval; faint: each seed")
+    return "; ".join(parts)
 
 
 def plot_curves(panels: dict[str, list[Curve]], x: XAxis, y: YAxis, smoothed: str, output: Path) -> Path:

@@ -74,13 +74,17 @@ def check_suffix(output: Path) -> None:
 def save(figure: Figure, output: Path) -> Path:
     """
     :param figure: what to save
-    :param output: image file, its kind told by its suffix
+    :param output: image file, its kind told by its suffix; a file of that name is replaced once the new one is complete
     :return: the file
     """
     check_suffix(output)
+    unfinished = output.with_name(f".{output.stem}.tmp{output.suffix}")
     undated = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}[output.suffix.lower()]
-    figure.savefig(output, dpi=200, metadata=undated)
-    return output
+    try:
+        figure.savefig(unfinished, dpi=200, metadata=undated)
+        return unfinished.replace(output)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def line_style(index: int) -> dict[str, Any]:

@@ -41,7 +41,7 @@ class PlotOptions(BaseModel):
     @property
     def kind(self) -> str:
         """What is drawn."""
-        return "scalars" if self.scalars or self.tags else "evaluations" if self.evaluations else "training"
+        return "scalars" if self.scalars or self.tags else "evaluations" if self.evaluations else "episodes"
 
 
 def plot(options: PlotOptions) -> Path:
@@ -59,11 +59,12 @@ def plot(options: PlotOptions) -> Path:
         groups = _groups(options)
         output = Path(options.output or _default_output(options, groups))
         style.check_suffix(output)
+        if not output.parent.is_dir():
+            raise ConfigError(f"--output: '{output}' cannot be written — there is no folder {output.parent}")
         panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
     except ValueError as error:
         raise ConfigError(str(error)) from None
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
         if options.kind == "scalars":
             title = ", ".join(dict.fromkeys(group.env for group in groups))
             plots.plot_scalars(panels, options.x_axis, output, title)
@@ -83,7 +84,7 @@ def plot(options: PlotOptions) -> Path:
 def _check(options: PlotOptions) -> None:
     if options.evaluations and options.kind == "scalars":
         raise ConfigError("--evaluations and --scalars: expected only one of them")
-    if options.mean_per is not None and options.kind != "training":
+    if options.mean_per is not None and options.kind != "episodes":
         raise ConfigError(f"--mean-per: {options.mean_per} — is for training episodes, not for --{options.kind}")
     if options.y_axis != "reward" and options.kind == "scalars":
         raise ConfigError(f"-y: {options.y_axis} — is for episodes, not for --scalars")
