@@ -56,7 +56,7 @@ _VIDEO_EXAMPLES = """examples:
 """
 _GAIT_EXAMPLES = """examples:
   sb3-symphony gait                                    the latest run of Symphony on BipedalWalker-v3
-  sb3-symphony gait logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 -l Symphony REDQ -o gaits.svg
+  sb3-symphony gait logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 -o gaits.svg
 """
 _PLOT_EXAMPLES = """examples:
   sb3-symphony plot                                        all runs in logs, a panel for each environment

@@ -42,7 +42,9 @@ def fails(capsys, *argv: str) -> str:
     return captured.err
 
 
-@pytest.mark.parametrize("command", [[], ["train"], ["enjoy"], ["evaluate"], ["export"], ["video"], ["gait"], ["plot"], ["list"]])
+@pytest.mark.parametrize(
+    "command", [[], ["train"], ["enjoy"], ["evaluate"], ["export"], ["video"], ["gait"], ["plot"], ["list"]]
+)
 def test_help_fits_one_screen(capsys, command):
     with pytest.raises(SystemExit) as error:
         main([*command, "--help"])

@@ -1,4 +1,4 @@
-"""Random malformed command lines of the commands on trained agents: one line, exit code 2, nothing on disk changes."""
+"""Random malformed command lines about trained agents and runs: one line, exit code 2, nothing on disk changes."""
 
 import contextlib
 import io
@@ -56,6 +56,39 @@ COMMANDS = {
         "--json": NO_FILE | st.just("."),
     },
     "enjoy": SELECTION | {"--n-timesteps": BAD_COUNT, "--n-envs": BAD_COUNT, "--reward-log": st.just("sac.zip")},
+    "video": SELECTION
+    | {
+        "--n-timesteps": BAD_COUNT,
+        "--n-episodes": BAD_COUNT,
+        "--seed": BAD_COUNT.filter(lambda text: text not in ("0", "-0")),
+        "--fps": BAD_COUNT | st.just("1000"),
+        "--width": BAD_COUNT | st.just("1") | st.just("1e6"),
+        "--output": NO_FILE | st.sampled_from(["sac.zip", "film", ".mp4/", "."]),
+    },
+    "gait": SELECTION
+    | {
+        "--n-timesteps": BAD_COUNT,
+        "--skip": NEGATIVE | st.just("1e300"),
+        "--window": NEGATIVE | st.just("0"),
+        "--n-frames": BAD_COUNT.filter(lambda text: text not in ("0", "-0")) | st.just("1000"),
+        "--output": NO_FILE | st.sampled_from(["sac.zip", "figure", ".png/", "."]),
+        "--json": NO_FILE | st.just("."),
+    },
+    "plot": {
+        "--algo": TEXT.filter(lambda text: text != "sac"),
+        "--env": TEXT.filter(lambda text: text != "Pendulum-v1"),
+        "--folder": NO_FILE,
+        "--tags": TEXT,
+        "--x-axis": TEXT.filter(lambda text: text not in ("steps", "episodes", "time")),
+        "--y-axis": TEXT.filter(lambda text: text not in ("reward", "length")),
+        "--episode-window": BAD_COUNT,
+        "--mean-per": BAD_COUNT | st.just("2"),
+        "--max-timesteps": BAD_COUNT | st.just("9"),
+        "--output": NO_FILE | st.sampled_from(["sac.zip", "figure", ".png/", "."]),
+        "--json": NO_FILE | st.just("."),
+        "--scalars": st.none(),
+        "--no-such-flag": st.none() | TEXT,
+    },
     "export": SELECTION | {"--output": NO_FILE | st.sampled_from(["sac.zip", "actor", ".onnx/", "."])},
 }
 
@@ -65,6 +98,10 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("malformed")
     model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs={"net_arch": [8]}, device="cpu")
     model.save(folder / "sac.zip")
+    run = folder / "logs" / "sac" / "Pendulum-v1_1"
+    (run / "Pendulum-v1").mkdir(parents=True)
+    (run / "Pendulum-v1" / "config.yml").write_text("n_timesteps: 10\n")
+    (run / "0.monitor.csv").write_text('#{"t_start": 0.0}\nr,l,t\n1.0,10,1.0\n')
     return folder
 
 
@@ -75,7 +112,7 @@ def test_malformed_command_lines(folder, monkeypatch, command, data):
     monkeypatch.chdir(folder)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     wrong = COMMANDS[command]
-    given_flags = {"--model": "sac.zip", "--algo": "sac", "--env": "Pendulum-v1"}
+    given_flags = {"--algo": "sac", "--env": "Pendulum-v1"} | ({} if command == "plot" else {"--model": "sac.zip"})
     if command == "enjoy":
         given_flags["--no-render"] = None
     for flag in data.draw(st.lists(st.sampled_from(sorted(wrong)), min_size=1, max_size=3, unique=True)):

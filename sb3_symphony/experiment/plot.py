@@ -59,11 +59,14 @@ def plot(options: PlotOptions) -> Path:
         groups = _groups(options)
         output = Path(options.output or _default_output(options, groups))
         style.check_suffix(output)
-        if not output.parent.is_dir():
-            raise ConfigError(f"--output: '{output}' cannot be written — there is no folder {output.parent}")
+        _check_file(output, "--output")
+        if options.json_file not in (None, "-"):
+            _check_file(Path(str(options.json_file)), "--json")
         panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
     except ValueError as error:
         raise ConfigError(str(error)) from None
+    except OSError as error:
+        raise ConfigError(f"'{error.filename}' cannot be read — {error.strerror}") from None
     try:
         if options.kind == "scalars":
             title = ", ".join(dict.fromkeys(group.env for group in groups))
@@ -90,6 +93,14 @@ def _check(options: PlotOptions) -> None:
         raise ConfigError(f"-y: {options.y_axis} — is for episodes, not for --scalars")
     if options.runs and (options.algo or options.env):
         raise ConfigError(f"{options.runs[0]}: expected run folders, or -a and -e to look for runs, not both")
+
+
+def _check_file(path: Path, flag: str) -> None:
+    # experiment.output does more, but loads torch
+    if path.is_dir():
+        raise ConfigError(f"{flag}: '{path}' cannot be written — it is a folder")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{flag}: '{path}' cannot be written — there is no folder {path.parent}")
 
 
 def _groups(options: PlotOptions) -> "list[Group]":
