@@ -288,6 +288,20 @@ class SumTree:
         self.first_leaf = 1 << max(n_leaves - 1, 0).bit_length()  # a power of two, so all leaves have the same depth
         self.nodes = np.zeros(2 * self.first_leaf)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickled without trailing zeros and sums, which make up most of a tree that is not full."""
+        used = np.flatnonzero(self.nodes[self.first_leaf :])
+        end = self.first_leaf + (int(used[-1]) + 1 if len(used) else 0)
+        return {"n_leaves": self.n_leaves, "values": self.nodes[self.first_leaf : end]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["n_leaves"])  # type: ignore[misc]
+        self.nodes[self.first_leaf : self.first_leaf + len(state["values"])] = state["values"]
+        level = self.first_leaf
+        while level > 1:  # the same sums as in set(), hence the same bits
+            children, level = self.nodes[level : 2 * level], level // 2
+            self.nodes[level : 2 * level] = children[::2] + children[1::2]
+
     @property
     def total(self) -> float:
         """Sum of all values."""

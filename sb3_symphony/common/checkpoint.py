@@ -248,6 +248,19 @@ def _same_bits(a: Any, b: Any) -> bool:
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
 
 
+def _generators_of(instance: gym.Env | gym.Space, name: str = "env") -> Iterator[tuple[str, np.random.Generator]]:
+    """All generators in use that an environment may draw from: its own ones, and those of its spaces."""
+    for key, value in vars(instance).items():
+        if isinstance(value, np.random.Generator):
+            yield f"{name}.{key}", value
+        elif isinstance(value, gym.Space):
+            yield from _generators_of(value, f"{name}.{key}")
+    parts: Any = getattr(instance, "spaces", ())  # of Dict and Tuple
+    items: Any = parts.items() if isinstance(parts, dict) else enumerate(parts)
+    for key, part in items:
+        yield from _generators_of(part, f"{name}.{key}")
+
+
 class RecordedEpisode(gym.Wrapper):
     """
     Remembers how the current episode began and its actions, from which the environment's state can be made again.
@@ -270,8 +283,10 @@ class RecordedEpisode(gym.Wrapper):
         :param options: handed to the environment
         :return: first observation and info
         """
-        generator = self._generator() if seed is None else None
-        self.start = {"generator": generator, "seed": seed, "options": options, "wrappers": self._wrappers()}
+        generators = self._generator_states()
+        if seed is not None:
+            generators.pop("env._np_random", None)  # which is about to be replaced
+        self.start = {"generators": generators, "seed": seed, "options": options, "wrappers": self._wrappers()}
         self.actions = []
         self.observation, info = self.env.reset(seed=seed, options=options)
         return self.observation, info
@@ -281,9 +296,10 @@ class RecordedEpisode(gym.Wrapper):
         :param action: action of the environment
         :return: observation, reward, terminated, truncated, info
         """
-        self.actions.append(np.copy(action))
-        self.observation, reward, terminated, truncated, info = self.env.step(action)
-        return self.observation, reward, terminated, truncated, info
+        self.actions.append(np.array(action))
+        result = self.env.step(action)
+        self.observation = result[0]
+        return result
 
     def state(self) -> dict[str, Any]:
         """:return: what :meth:`replay` and :meth:`start_anew` need"""
@@ -291,7 +307,7 @@ class RecordedEpisode(gym.Wrapper):
             "start": self.start,
             "actions": np.array(self.actions),
             "observation": self.observation,
-            "generator": self._generator(),
+            "generators": self._generator_states(),
             "wrappers": self._wrappers(),
             "monitor": {name: getattr(self.monitor, name) for name in _MONITOR_STATE},
             "elapsed": time.time() - self.monitor.t_start,
@@ -308,7 +324,7 @@ class RecordedEpisode(gym.Wrapper):
         self.monitor.results_writer = None  # an episode that ends here never happened
         try:
             self._set_wrappers(start["wrappers"])
-            self._set_generator(start["generator"])
+            self._set_generators(start["generators"])
             self.reset(seed=start["seed"], options=start["options"])
             for action in state["actions"]:
                 _, _, terminated, truncated, _ = self.step(action)
@@ -327,7 +343,7 @@ class RecordedEpisode(gym.Wrapper):
         :param state: from :meth:`state`
         """
         self._set_wrappers(state["wrappers"])
-        self._set_generator(state["generator"])
+        self._set_generators(state["generators"])
         self._set_monitor(state)
 
     @property
@@ -342,12 +358,13 @@ class RecordedEpisode(gym.Wrapper):
             setattr(self.monitor, name, value)
         self.monitor.t_start = time.time() - state["elapsed"]
 
-    def _generator(self) -> dict[str, Any]:
-        return dict(self.unwrapped.np_random.bit_generator.state)
+    def _generator_states(self) -> dict[str, Any]:
+        return {name: generator.bit_generator.state for name, generator in _generators_of(self.unwrapped)}
 
-    def _set_generator(self, state: dict[str, Any] | None) -> None:
-        if state is not None:
-            self.unwrapped.np_random.bit_generator.state = state
+    def _set_generators(self, states: dict[str, Any]) -> None:
+        for name, generator in _generators_of(self.unwrapped):
+            if name in states:
+                generator.bit_generator.state = states[name]
 
     def _inner_wrappers(self) -> Iterator[gym.Wrapper]:
         env = self.env
@@ -494,7 +511,7 @@ def training_state(model: BaseAlgorithm) -> dict[str, Any]:
         "attributes": {name: value for name, value in _attributes(model).items() if name not in dropped},
         "parameters": model.get_parameters(),
         "tensors": {name: recursive_getattr(model, name) for name in tensors},
-        "gSDE": [(each.exploration_mat, each.exploration_matrices) for each in _gsde_distributions(model)],
+        "gSDE": [(each.exploration_mat.detach(), each.exploration_matrices.detach()) for each in _gsde_distributions(model)],
         "noise": None if noise is None else vars(noise),
         # Values recorded but not written yet
         "log": {name: dict(vars(logger)[name]) for name in ("name_to_value", "name_to_count", "name_to_excluded")},

@@ -102,7 +102,7 @@ def open_run(options: TrainOptions) -> StoredRun:
                 f"with --resume only {allowed} may differ"
             )
     changed = {name: value for name, value in given.items() if name in _CHANGEABLE}
-    if "progress" in changed:
+    if changed.get("progress", stored.progress) != stored.progress:
         changed.setdefault("verbose", None)  # which depends on it
     resumed = stored.model_copy(update=changed)
     # The run's own file, not the shipped one, which may have changed since

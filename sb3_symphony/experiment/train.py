@@ -1,5 +1,6 @@
 """One training run, from options to files on disk."""
 
+import errno
 import io
 import shlex
 import time
@@ -197,6 +198,17 @@ def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     write_atomically(run.model, content.getvalue())
 
 
+@contextmanager
+def _full_disk_told(run: RunFolder) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        onward = " — once there is room, --resume goes on from the newest checkpoint" if run.checkpoints.is_dir() else ""
+        raise ConfigError(f"'{run.path}' cannot be written: {error.strerror}{onward}") from error
+
+
 def train(options: TrainOptions, command: str | None = None, folder: Path | None = None) -> TrainResult:
     """
     Train one agent and write its run folder, or go on with a run that was stopped.
@@ -285,12 +297,12 @@ def _train(
 
     total = config.settings.n_timesteps
     print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
-    with stop.listening():
+    with stop.listening(), _full_disk_told(run):
         try:
             model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:
             stop.requested = True
-        seconds = (time.time_ns() - model.start_time) / 1e9
+        seconds = (time.time_ns() - (model.start_time or time.time_ns())) / 1e9
         if options.progress:
             bar.close()
         finished = checkpoints is not None and checkpoints.finished
