@@ -337,3 +337,12 @@ def test_mistakes_in_a_configuration(tmp_path, monkeypatch, capsys, algo, value,
     errors = capsys.readouterr().err
     assert message in errors and errors.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_resumed_run_goes_on_counting(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    callback = "callback:{QBiasCallback: {eval_freq: 30, n_pairs: 20, max_episode_steps: 20}}"
+    assert train("--algo", "td3", *SMALL, callback, "--save-freq", "50") == 0
+    assert main("train --resume logs/td3/Pendulum-v1_1 -n 130 --no-progress".split()) == 0
+    events = EventAccumulator(str(tmp_path / "tb" / "Pendulum-v1" / "TD3_1")).Reload()
+    assert [event.step for event in events.Scalars("q_bias/mean")] == [30, 60, 90, 120]
