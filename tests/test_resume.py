@@ -457,9 +457,9 @@ def fail_to_write(monkeypatch, fails):
     monkeypatch.setattr(os, "fsync", full)
 
 
-@pytest.mark.parametrize("failing", [5, 7])
+@pytest.mark.parametrize("failing", [6, 8, 10])
 def test_no_room_for_a_checkpoint(monkeypatch, killed, capsys, failing):
-    """Each checkpoint synchronises a segment, the folder, a state, the folder: the second one's segment or state fails."""
+    """Each checkpoint synchronises a segment, the folder, all models, a state, the folder; in the second one, one fails."""
     whole = train(options(log_folder="a")).run.path
     with monkeypatch.context() as patched:
         fail_to_write(patched, lambda call: call == failing)
@@ -478,7 +478,7 @@ def test_no_room_at_the_end(monkeypatch, capsys):
     argv = "train --algo td3 --env Pendulum-v1 -n 260 --seed 1 --eval-freq 0 --verbose 0 --num-threads 1 --save-freq 100 -f b"
     small = ["-params", "learning_starts:50", "buffer_size:1000", "batch_size:16", "policy_kwargs.net_arch:[8]"]
     with monkeypatch.context() as patched:
-        fail_to_write(patched, lambda call: call > 8)
+        fail_to_write(patched, lambda call: call > 11)
         assert main([*argv.split(), *small]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "No space left on device — once there is room, --resume goes on" in error

@@ -143,9 +143,14 @@ class ReplaySegments:
     """
     A replay buffer on disk, to which each call of :meth:`save` adds what is new.
 
+    So that frequent checkpoints do not leave thousands of files, a new segment repeats what is in the one before as long as
+    it is still small.
+
     :param folder: where the segments are kept
     :param segments: those that are there already
     """
+
+    small = 2**20  # bytes
 
     def __init__(self, folder: Path, segments: Sequence[Segment] = ()) -> None:
         self.folder = folder
@@ -163,10 +168,14 @@ class ReplaySegments:
         first = max(rows - buffer.buffer_size, 0)  # the oldest row still there
         start = max(self.saved, first)
         if start < rows:
+            row_bytes = sum(array[0].nbytes for _, array in _storage(buffer))
+            before = self.segments
+            while before and (rows - before[-1].start) * row_bytes <= self.small:
+                start, before = max(before[-1].start, first), before[:-1]
             places = np.arange(start, rows) % buffer.buffer_size
             path = self.folder / f"replay_{start:09d}_{rows:09d}.segment"
             checksum = _seal(path, {name: array[places] for name, array in _storage(buffer)})
-            self.segments.append(Segment(start, rows, path.name, checksum))
+            self.segments = [*before, Segment(start, rows, path.name, checksum)]
             self.saved = rows
         self.segments = [segment for segment in self.segments if segment.stop > first]
         return list(self.segments)
@@ -606,6 +615,8 @@ class ExactCheckpoints(BaseCallback):
     :param keep: number of checkpoints to keep, >= 1; with 1 there is none to go back to if the newest is damaged
     :param callbacks: callbacks whose counts and collected values belong to the state
     :param files: gives the files (such as ``0.monitor.csv``) whose content belongs to the state
+    :param beside: gives files that have to be on the disk before a checkpoint is, such as a best model that is not to be
+        made again
     :param checkpoint: where to go on from; ``learn()`` is then called as for the whole run, with the total number of steps
     :param wanted: asked at the start of each rollout whether a checkpoint is wanted there, for example before stopping
     :param report: what to do with a message
@@ -618,6 +629,7 @@ class ExactCheckpoints(BaseCallback):
         keep: int = 2,
         callbacks: Sequence[BaseCallback] = (),
         files: Callable[[], Sequence[Path]] = tuple,
+        beside: Callable[[], Sequence[Path]] = tuple,
         checkpoint: Checkpoint | None = None,
         wanted: Callable[[], bool] = bool,
         report: Callable[[str], None] = print,
@@ -630,6 +642,7 @@ class ExactCheckpoints(BaseCallback):
         self.keep = keep
         self.callbacks = callbacks
         self.files = files
+        self.beside = beside
         self.wanted = wanted
         self.report = report
         self.finished = False  # whether learn() came to its end, with everything learned that was experienced
@@ -679,7 +692,8 @@ class ExactCheckpoints(BaseCallback):
             self.folder.mkdir(parents=True, exist_ok=True)
             state = training_state(model)
             state["rollout follows"] = rollout_follows
-            state["log folder"] = model.logger.get_dir()
+            log_folder = model.logger.get_dir()
+            state["log folder"] = None if log_folder is None else os.path.abspath(log_folder)
             state["callbacks"] = {type(callback).__name__: _attributes(callback) for callback in self.callbacks}
             state["files"] = {path.name: path.read_bytes() for path in self.files()}
             state["episodes"] = [copy.state() for copy in _recorded(model.env)]
@@ -687,6 +701,9 @@ class ExactCheckpoints(BaseCallback):
             if self._buffer is not None:
                 state["buffer"] = _buffer_state(self._buffer)
                 state["segments"] = self.segments.save(self._buffer, steps // model.n_envs)
+            for path in self.beside():
+                with open(path, "r+b") as file:
+                    os.fsync(file.fileno())
             _seal(self.folder / f"checkpoint_{steps:09d}.ckpt", state)
         except OSError as error:
             self.report(f"no checkpoint at {steps} steps: {error.strerror} — training goes on, older ones are unharmed")

@@ -279,9 +279,15 @@ def _train(
     checkpoints = None
     if options.save_freq > 0:
         record_episodes(env)
-        files = run.growing_files
         checkpoints = ExactCheckpoints(
-            run.checkpoints, options.save_freq, options.keep, tuple(callbacks), files, checkpoint, wanted=stop.here
+            run.checkpoints,
+            options.save_freq,
+            options.keep,
+            callbacks=tuple(callbacks),
+            files=run.growing_files,
+            beside=run.saved_models,
+            checkpoint=checkpoint,
+            wanted=stop.here,
         )
         callbacks.append(checkpoints)
     callbacks += [stop, NoteLogFolder(run.log_folder)]  # the checkpoint is made before
