@@ -58,6 +58,12 @@ _GAIT_EXAMPLES = """examples:
   sb3-symphony gait                                    the latest run of Symphony on BipedalWalker-v3
   sb3-symphony gait logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 -o gaits.svg
 """
+_BENCH_EXAMPLES = """examples:
+  sb3-symphony bench benchmarks/studies/bipedalwalker/study.yml --quick
+  sb3-symphony bench study.yml -j 8                       the same command goes on after Ctrl-C, kill -9 or a power cut
+  sb3-symphony bench study.yml --backend ray --address 192.168.0.10:6379 -f /shared/results
+  sb3-symphony bench study.yml --report                   tables and figures anew, from the results that are there
+"""
 _PLOT_EXAMPLES = """examples:
   sb3-symphony plot                                        all runs in logs, a panel for each environment
   sb3-symphony plot -a symphony sac -e BipedalWalker-v3 -o walker.svg
@@ -385,6 +391,35 @@ def _plot(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     return 0
 
 
+def _add_bench(commands: Any) -> None:
+    parser = commands.add_parser(
+        "bench",
+        help="train a grid of algorithms, environments and seeds, and compare them",
+        usage="%(prog)s STUDY.yml [options]",
+        description="Train all cells of a study that are not done yet, each in a process of its own; then write tables and "
+        "figures.",
+        epilog=_BENCH_EXAMPLES,
+    )
+    parser.add_argument("study", metavar="STUDY.yml", help="algorithms, environments and seeds, see docs/command-line.md")
+    add = partial(parser.add_argument, default=argparse.SUPPRESS)
+    add("--quick", action="store_true", help="the study's version of a few minutes")
+    add("-j", "--n-jobs", type=_whole_number, metavar="N", help="cells at a time (default: one for each core)")
+    add("--backend", choices=("loky", "ray"), help="loky: this machine; ray: a cluster (default: loky)")
+    add("--address", metavar="A", help="Ray cluster, HOST:PORT or auto (default: one is started on this machine)")
+    add("-f", "--folder", metavar="DIR", help="where results are kept (default: logs/bench/<study>)")
+    add("--report", action="store_true", help="only write tables and figures")
+    add("--dry-run", action="store_true", help="only show the cells and how far they are")
+    parser.set_defaults(run=_bench, parser=parser)
+
+
+def _bench(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    from sb3_symphony.experiment.grid import BenchOptions, bench
+
+    result = bench(validated(BenchOptions, arguments))
+    print(result.summary())
+    return 130 if result.interrupted else int(bool(result.failed))
+
+
 def _add_list(commands: Any) -> None:
     parser = commands.add_parser(
         "list",
@@ -421,6 +456,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_plot(commands)
     _add_video(commands)
     _add_gait(commands)
+    _add_bench(commands)
     _add_list(commands)
     return parser
 

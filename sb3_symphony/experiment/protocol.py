@@ -20,8 +20,12 @@ def reward_threshold(env_id: str) -> float | None:
     """
     :param env_id: registered id of an environment
     :return: the return from which on it counts as solved, as far as it is registered with one
+    :raises ConfigError: if there is no such environment
     """
-    threshold = gym.spec(env_id).reward_threshold
+    try:
+        threshold = gym.spec(env_id).reward_threshold
+    except (gym.error.Error, ImportError) as error:
+        raise ConfigError(f"environment '{env_id}' — {error}") from None
     return None if threshold is None else float(threshold)
 
 

@@ -1,0 +1,352 @@
+"""
+Results of a grid as tables: one CSV row per episode, one per run, and a Markdown table for each environment.
+
+What the columns of the Markdown table mean is said under it. A run that ended before an event is censored, and a number that
+depends on what it would have done is written "> n".
+"""
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from sb3_symphony.analysis.runs import Run
+from sb3_symphony.analysis.statistics import Event, RunEvents, iqm, iqm_event, median_event, run_events, summarise
+
+#: environment seed of the first evaluation episode
+_EVALUATION_SEED = 10_000
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """
+    What counts as success in an environment.
+
+    :param solved: return that solves it; None: nothing does
+    :param unstable_below: return below which an episode counts as a failure once it is solved; None: none does
+    """
+
+    solved: float | None
+    unstable_below: float | None
+
+
+@dataclass(frozen=True)
+class Result:
+    """
+    One run of a grid.
+
+    :param algorithm: name of the variant
+    :param environment: id of the environment
+    :param seed: seed
+    :param thresholds: what counts as success
+    :param run: its files; None if there are none yet
+    :param summary: ``steps``, ``updates``, ``seconds`` and, if it was asked for, ``final``; None as long as it is not done
+    """
+
+    algorithm: str
+    environment: str
+    seed: int
+    thresholds: Thresholds
+    run: Run | None
+    summary: dict[str, Any] | None
+
+    @cached_property
+    def events(self) -> RunEvents:
+        """What the run reached; without a threshold only its maxima mean something."""
+        assert self.run is not None
+        solved, below = self.thresholds.solved, self.thresholds.unstable_below
+        return run_events(self.run.path, math.inf if solved is None else solved, -math.inf if below is None else below)
+
+    @property
+    def standard(self) -> bool:
+        """Whether it was evaluated by the standard protocol."""
+        return self.run is not None and self.run.options.get("protocol") == "standard"
+
+    @property
+    def final(self) -> np.ndarray:
+        """Returns of the episodes that the model was evaluated on at the end, shape ``(n,)``."""
+        return np.array((self.summary or {}).get("final", {}).get("returns", []), dtype=np.float64)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# CSV
+# ----------------------------------------------------------------------------------------------------------------------
+
+Row = dict[str, Any]
+
+
+def as_csv(rows: Iterable[Row]) -> str:
+    """
+    :param rows: column → value, the same columns in each; at least one
+    :return: the rows as text, with a line of names; None is empty
+    """
+    rows = iter(rows)
+    first = next(rows)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(first), lineterminator="\n")
+    writer.writeheader()
+    writer.writerow(first)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _of(result: Result) -> Row:
+    return {"algorithm": result.algorithm, "environment": result.environment, "seed": result.seed}
+
+
+def _plain(values: np.ndarray | Sequence[Any] | None, n: int) -> list[Any]:
+    if values is None:
+        return [None] * n
+    return [
+        None if value is None else int(value) if isinstance(value, bool) else value for value in np.asarray(values).tolist()
+    ]
+
+
+def episode_rows(results: Iterable[Result]) -> Iterator[Row]:
+    """
+    :param results: runs
+    :return: a row for each episode: of training (``step`` is that of its end), of an evaluation in its course (``step`` is
+        that of the training), and of the evaluation at the end
+    """
+    columns = ("kind", "step", "episode", "environment_seed", "return", "length", "success")
+
+    def rows(result: Result, kind: str, steps: Any, seeds: Any, returns: Any, lengths: Any, successes: Any) -> Iterator[Row]:
+        n = len(returns)
+        all_columns = ([kind] * n, steps, range(1, n + 1), seeds, returns, lengths, successes)
+        for values in zip(*(_plain(values, n) for values in all_columns), strict=True):
+            yield {**_of(result), **dict(zip(columns, values, strict=True))}
+
+    for result in results:
+        if result.run is None:
+            continue
+        training, evaluations = result.run.episodes, result.run.evaluations
+        if training is not None:
+            yield from rows(result, "training", training.steps, None, training.returns, training.lengths, training.successes)
+        if evaluations is not None:
+            for i, step in enumerate(evaluations.steps):
+                returns, lengths = evaluations.returns[i], evaluations.lengths[i]
+                seeds = range(_EVALUATION_SEED, _EVALUATION_SEED + len(returns))
+                successes = None if evaluations.successes is None else evaluations.successes[i]
+                yield from rows(result, "evaluation", [step] * len(returns), seeds, returns, lengths, successes)
+        final = (result.summary or {}).get("final")
+        if final:
+            n = len(final["returns"])
+            assert result.summary is not None
+            seeds, steps = range(final["seed"], final["seed"] + n), [result.summary["steps"]] * n
+            yield from rows(result, "final", steps, seeds, final["returns"], final["lengths"], final["successes"])
+
+
+def _event(name: str, event: Event | None) -> Row:
+    if event is None:
+        return {f"{name}_{column}": None for column in ("reached", "step", "episode")}
+    return {f"{name}_reached": int(event.reached), f"{name}_step": event.step, f"{name}_episode": event.episode}
+
+
+def run_row(result: Result) -> Row:
+    """
+    :param result: a run
+    :return: what it reached, as a row; where an event was not reached, its step is the last one
+    """
+    summary = result.summary or {}
+    events = None if result.run is None else result.events
+    solved = None if result.thresholds.solved is None else events
+    unstable = None if result.thresholds.unstable_below is None else solved
+    final = summarise(result.final) if len(result.final) else None
+    return {
+        **_of(result),
+        "protocol": "standard" if result.standard else "non-standard",
+        "done": int(result.summary is not None),
+        "steps": summary.get("steps"),
+        "updates": summary.get("updates"),
+        "seconds": summary.get("seconds"),
+        "threshold": result.thresholds.solved,
+        **_event("stable", None if solved is None else solved.stable),
+        **_event("first", None if solved is None else solved.episode),
+        **_event("trailing", None if solved is None else solved.trailing),
+        "unstable": None if unstable is None else unstable.unstable,
+        "unstable_of": None if unstable is None else unstable.unstable_of,
+        "best_evaluation": None if events is None else _finite(events.best_evaluation),
+        "best_episode": None if events is None else _finite(events.best_episode),
+        "final_episodes": None if final is None else final.n,
+        "final_mean": None if final is None else final.mean,
+        "final_std": None if final is None else final.std,
+        "final_iqm": None if final is None else final.iqm,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Markdown
+# ----------------------------------------------------------------------------------------------------------------------
+
+_NOTHING = "–"
+
+
+def _number(value: float) -> str:
+    """Rounded, with a space between thousands."""
+    return f"{value:,.0f}".replace(",", " ")
+
+
+def _bound(bound: tuple[float, bool]) -> str:
+    value, exact = bound
+    return f"{'' if exact else '> '}{_number(value)}"
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{minutes // 60}:{minutes % 60:02} h" if seconds >= 60 else f"{seconds:.0f} s"
+
+
+def _median_of(events: Sequence[Event]) -> str:
+    """Median episode, and step in brackets."""
+    reached = [event.reached for event in events]
+    episode = median_event([event.episode or 0 for event in events], reached)
+    return f"{_bound(episode)} ({_bound(median_event([event.step for event in events], reached))})"
+
+
+def _stable_iqm(events: Sequence[Event]) -> str:
+    mean, low, high = iqm_event([event.step for event in events], [event.reached for event in events])
+    return f"{_bound(mean)} ({_bound(low)} … {_bound(high)})" if len(events) > 1 else _bound(mean)
+
+
+def _unstable(done: Sequence[Result]) -> str:
+    failed, counted = (sum(getattr(each.events, name) for each in done) for name in ("unstable", "unstable_of"))
+    return f"{failed} / {counted}" if counted else _NOTHING
+
+
+def _maximum(done: Sequence[Result]) -> str:
+    best = [each.events.best_evaluation for each in done if math.isfinite(each.events.best_evaluation)]
+    return f"{np.median(best):.1f} ({max(best):.1f})" if best else _NOTHING
+
+
+def _final_iqm(done: Sequence[Result]) -> str:
+    means = [each.final.mean() for each in done if len(each.final)]
+    if not means:
+        return _NOTHING
+    summary = summarise(means)
+    return f"{summary.iqm:.1f} ({summary.low:.1f} … {summary.high:.1f})" if len(means) > 1 else f"{summary.iqm:.1f}"
+
+
+def _final_episodes(done: Sequence[Result]) -> str:
+    returns = np.concatenate([each.final for each in done])
+    return f"{returns.mean():.1f} ± {returns.std():.1f}, {iqm(returns):.1f}" if len(returns) else _NOTHING
+
+
+Column = tuple[str, Callable[[Sequence[Result]], str]]
+
+
+def _columns(results: Sequence[Result]) -> list[Column]:
+    """The columns that have something to say: events need a threshold, the final quality an evaluation at the end."""
+    thresholds = results[0].thresholds
+    columns: list[Column] = []
+    if thresholds.solved is not None:
+        name = f"{thresholds.solved:g}"
+        columns += [
+            (f"S{name} median", lambda done: _bound(median_event(*_steps(done)))),
+            (f"S{name} IQM (95 % CI)", lambda done: _stable_iqm([each.events.stable for each in done])),
+            (f"E{name}", lambda done: _median_of([each.events.episode for each in done])),
+            (f"T{name}", lambda done: _median_of([each.events.trailing for each in done])),
+        ]
+        if thresholds.unstable_below is not None:
+            columns.append(("unstable", _unstable))
+    columns.append(("maximum", _maximum))
+    if any(len(each.final) for each in results):
+        columns += [("final IQM (95 % CI)", _final_iqm), ("final episodes", _final_episodes)]
+    columns += [
+        ("updates", lambda done: _number(np.median([_summary(each)["updates"] for each in done]))),
+        ("wall-clock", lambda done: _duration(float(np.median([_summary(each)["seconds"] for each in done])))),
+    ]
+    return columns
+
+
+def _steps(done: Sequence[Result]) -> tuple[list[int], list[bool]]:
+    return [each.events.stable.step for each in done], [each.events.stable.reached for each in done]
+
+
+def _summary(result: Result) -> dict[str, Any]:
+    assert result.summary is not None
+    return result.summary
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """A Markdown table that is readable as text too: names to the left, numbers to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [
+        f"| {row[0]:{widths[0]}} | "
+        + " | ".join(f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))
+        + " |"
+        for row in rows
+    ]
+    rule = f"|{'-' * (widths[0] + 2)}|" + "|".join(f"{'-' * (width + 1)}:" for width in widths[1:]) + "|"
+    return [lines[0], rule, *lines[1:]]
+
+
+def markdown_table(results: Sequence[Result]) -> str:
+    """
+    :param results: runs on one environment, in the order of its rows
+    :return: heading, table and what its columns mean
+    """
+    columns = _columns(results)
+    rows = [["algorithm", "seeds", "steps", *(name for name, _ in columns)]]
+    for algorithm in dict.fromkeys(each.algorithm for each in results):
+        own = [each for each in results if each.algorithm == algorithm]
+        done = [each for each in own if each.summary is not None]
+        mark = "" if all(each.standard for each in own if each.run) else " (non-standard)"
+        seeds = f"{len(done)}" if len(done) == len(own) else f"{len(done)} of {len(own)}"
+        steps = " or ".join(_number(n) for n in sorted({_summary(each)["steps"] for each in done})) or _NOTHING
+        rows.append([algorithm + mark, seeds, steps, *(write(done) if done else _NOTHING for _, write in columns)])
+    names = [name for name, _ in columns]
+    return "\n".join([f"### {results[0].environment}", "", *_aligned(rows), "", *_meaning(results, names), ""])
+
+
+def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
+    """What the columns are."""
+    thresholds = results[0].thresholds
+    lines = []
+    if any(name.startswith("S") for name in names):
+        name = f"{thresholds.solved:g}"
+        lines += [
+            f"- S{name}: environment step of the first of two consecutive evaluations with mean return ≥ {name}",
+            f"- E{name}: first training episode with return ≥ {name}; T{name}: first one at which the mean of the latest 100 "
+            f"is ≥ {name}. Median over seeds, in brackets the environment step",
+            '- "> n": the number depends on runs that ended before',
+        ]
+    if "unstable" in names:
+        below = f"{thresholds.unstable_below:g}"
+        lines.append(
+            f"- unstable: evaluation episodes with return < {below} within 100 000 steps after S{thresholds.solved:g}, of all "
+            "seeds"
+        )
+    lines.append("- maximum: largest mean return of an evaluation, median over seeds, in brackets that of the best seed")
+    final = sorted({len(each.final) for each in results if len(each.final)})
+    if final:
+        episodes = " or ".join(map(str, final))
+        lines.append(
+            f"- final: the model at the end, deterministic, {episodes} episodes: IQM over the seeds' means; mean ± standard "
+            "deviation and IQM of all episodes"
+        )
+    lines.append(
+        "- updates, wall-clock (with evaluations, several runs at a time): median over seeds. IQM: interquartile mean; CI: "
+        "bootstrap interval over seeds"
+    )
+    other = sorted({_protocol(each.run) for each in results if each.run is not None and not each.standard})
+    lines += [f"- non-standard: {protocol}" for protocol in other]
+    missing = [f"{each.algorithm} {each.seed}" for each in results if each.summary is None]
+    if missing:
+        lines.append(f"- not done, and not in these numbers: {', '.join(missing)}")
+    return lines
+
+
+def _protocol(run: Run) -> str:
+    frequency, episodes = run.options.get("eval_freq"), run.options.get("eval_episodes")
+    if not frequency:
+        return "no evaluation while training"
+    return f"evaluated every {_number(frequency)} steps on {episodes} episode" + "s" * (episodes != 1)

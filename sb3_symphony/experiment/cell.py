@@ -1,0 +1,324 @@
+"""
+One cell of a grid: a training run in a process of its own, which goes on where it was stopped, and its final quality.
+
+A worker calls :func:`supervise`, which starts ``python -m sb3_symphony.experiment.cell`` and waits. So a crash, a lack of
+memory or whatever an environment does to its process ends one cell and nothing else, and every cell begins in a process
+that nothing has happened in. Workers may be on other machines: the one who started the grid tells them through a file on
+the file system that all share (:class:`Control`) whether he is still there and whether to stop.
+
+A worker imports this module; what is heavy is imported by the cell's own process only.
+"""
+
+import json
+import os
+import platform
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import traceback
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
+
+from sb3_symphony.experiment.config import ConfigError, TrainOptions
+from sb3_symphony.experiment.run_folder import RunFolder
+
+#: seconds without a sign of life after which a cell stops by itself
+PATIENCE = 120.0
+#: seconds between two looks at the control file
+_POLL = 0.5
+
+
+class Control:
+    """
+    What the one who started a grid tells its cells.
+
+    :param path: file on a file system that all machines share
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.beats = 0
+
+    def say(self, stop: int) -> None:
+        """
+        Tell that he is still there.
+
+        :param stop: 0: go on; 1: save and stop; 2: stop at once; 3: end without saving
+        """
+        self.beats += 1
+        temporary = self.path.with_name(f".{self.path.name}.tmp")
+        temporary.write_text(json.dumps({"beat": self.beats, "stop": stop}), encoding="utf-8")
+        temporary.replace(self.path)
+
+    def heard(self) -> dict[str, int] | None:
+        """:return: ``beat`` and ``stop``; None if the file cannot be read just now"""
+        try:
+            return json.loads(self.path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+
+
+@dataclass(frozen=True)
+class Job:
+    """
+    What a worker is to do. Paths are absolute and the same on all machines.
+
+    :param name: name of the cell
+    :param options: options of ``train``, of a run that begins
+    :param run: its run folder
+    :param final_episodes: episodes to evaluate the model on at the end
+    :param session: folder of this execution of the grid, with ``control.json``
+    """
+
+    name: str
+    options: dict[str, Any]
+    run: str
+    final_episodes: int
+    session: str
+
+    @property
+    def log(self) -> Path:
+        """What its process prints."""
+        return Path(f"{self.run}.log")
+
+    @property
+    def started(self) -> Path:
+        """File that tells that a worker has begun with it."""
+        return Path(self.session) / f"{quote(self.name, safe='')}.started"
+
+    @property
+    def control(self) -> Control:
+        """What the one who started the grid says."""
+        return Control(Path(self.session) / "control.json")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    How a job ended.
+
+    :param state: ``done``; ``failed``; ``stopped`` before it was done; ``queued`` if it was not begun
+    :param reason: why it failed
+    """
+
+    state: Literal["done", "failed", "stopped", "queued"]
+    reason: str = ""
+
+
+def supervise(job: Job) -> Outcome:
+    """
+    Run a cell in a process of its own.
+
+    :param job: what to do
+    :return: how it ended
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        # Ctrl-C in a terminal reaches all processes there; they are told by the control file instead. The cell inherits this
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    said = job.control.heard()
+    if said is None or said["stop"]:
+        return Outcome("queued")
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    job.started.write_text(socket.gethostname(), encoding="utf-8")
+    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    with job.log.open("ab") as log:
+        log.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')} on {socket.gethostname()}\n".encode())
+        log.flush()
+        ended = subprocess.run(
+            [sys.executable, "-m", __name__],
+            input=json.dumps(vars(job)).encode(),
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, **one_thread},
+            check=False,
+        )
+    if ended.returncode == 0:
+        return Outcome("done")
+    said = job.control.heard()
+    if ended.returncode == _STOPPED or (said is not None and said["stop"]):
+        return Outcome("stopped")
+    return Outcome("failed", _reason(ended.returncode, job.log))
+
+
+def _reason(code: int, log: Path) -> str:
+    if code < 0:
+        name = signal.Signals(-code).name
+        return f"its process was ended by {name}" + " (out of memory?)" * (name == "SIGKILL")
+    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    return lines[-1] if lines else f"its process ended with code {code}"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The cell's own process
+# ----------------------------------------------------------------------------------------------------------------------
+
+_STOPPED = 130
+
+
+def _obey(control: Control) -> None:
+    """Stop when that is said, or when nobody is left to say it. Signals do the stopping, as if by hand."""
+    parent, beat, heard, obeyed = os.getppid(), None, time.monotonic(), 0
+    while True:
+        time.sleep(_POLL)
+        if os.getppid() != parent:  # the worker was killed: another one may begin with this cell any moment
+            os._exit(1)
+        said = control.heard()
+        if said is not None and said["beat"] != beat:
+            beat, heard = said["beat"], time.monotonic()
+        wanted = said["stop"] if said is not None else 0
+        if time.monotonic() - heard > PATIENCE:
+            wanted = max(wanted, 1)
+        while obeyed < wanted:
+            obeyed += 1
+            if obeyed == 3:
+                os._exit(_STOPPED)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def result_file(run: Path) -> Path:
+    """
+    :param run: run folder of a cell
+    :return: the file that is there once the cell is done
+    """
+    return run / "result.json"
+
+
+def read_result(run: Path) -> dict[str, Any] | None:
+    """
+    :param run: run folder of a cell
+    :return: content of its :func:`result_file`; None if there is none
+    """
+    try:
+        return json.loads(result_file(run).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _command(options: TrainOptions) -> str:
+    """The command line that does the same as a cell, but for the name of its folder."""
+    flags = {
+        "--algo": options.algo,
+        "--env": options.env,
+        "-n": options.n_timesteps,
+        "--seed": options.seed,
+        "-conf": options.conf_file,
+        "--save-freq": options.save_freq,
+        "--device": options.device,
+        "--num-threads": options.num_threads,
+        "--verbose": options.verbose,
+        "--protocol": options.protocol,
+        "--threshold": options.threshold,
+    }
+    if options.protocol is None:
+        flags |= {"--eval-freq": options.eval_freq, "--eval-episodes": options.eval_episodes}
+    return "sb3-symphony train " + " ".join(f"{k} {shlex.quote(str(v))}" for k, v in flags.items() if v is not None)
+
+
+def run_cell(job: Job) -> bool:
+    """
+    Train, going on with what is there, and evaluate the model.
+
+    :param job: what to do
+    :return: whether it is done; False if it was stopped
+    :raises ConfigError: if options or configuration are wrong
+    """
+    from sb3_symphony.common.checkpoint import write_atomically
+    from sb3_symphony.experiment.train import train
+
+    options = TrainOptions.model_validate(job.options)
+    run = RunFolder(Path(job.run), RunFolder.file_name(options.env))
+    if (run.details / "args.yml").is_file():
+        again = TrainOptions(resume=str(run.path), n_timesteps=options.n_timesteps, save_freq=options.save_freq)
+        result = train(again, _command(options))
+    else:
+        if run.path.exists():
+            shutil.rmtree(run.path)  # of a process that died before its run had begun
+        result = train(options, _command(options), run.path)
+    if result.interrupted:
+        return False
+    content = {
+        "n_timesteps": options.n_timesteps,
+        "steps": result.steps,
+        "updates": _updates(run.model),
+        "seconds": round(_seconds(run) if result.untouched else result.seconds, 3),
+        "machine": _machine(),
+        **({"final": _final(job, options)} if job.final_episodes else {}),
+    }
+    write_atomically(result_file(run.path), (json.dumps(content, indent=1) + "\n").encode())
+    return True
+
+
+def _updates(model: Path) -> int:
+    with zipfile.ZipFile(model) as archive:
+        return int(json.loads(archive.read("data"))["_n_updates"])
+
+
+def _seconds(run: RunFolder) -> float:
+    """Wall-clock time of a run whose process ended before it could tell."""
+    from sb3_symphony.common.checkpoint import newest_checkpoint
+
+    checkpoint = newest_checkpoint(run.checkpoints)
+    assert checkpoint is not None  # a run is finished when it has its last one
+    return checkpoint.state["elapsed"] / 1e9
+
+
+def _machine() -> dict[str, Any]:
+    from importlib.metadata import version
+
+    import torch as th
+
+    packages = ("sb3-symphony", "torch", "numpy", "stable_baselines3", "gymnasium")
+    return {
+        "host": socket.gethostname(),
+        "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
+        "cores": os.cpu_count(),
+        "Python": platform.python_version(),
+        **{package: version(package) for package in packages},
+    }
+
+
+def _final(job: Job, options: TrainOptions) -> dict[str, Any]:
+    from sb3_symphony.experiment.evaluate import evaluate
+    from sb3_symphony.experiment.select import EvaluateOptions
+
+    result = evaluate(EvaluateOptions(model=job.run, n_episodes=job.final_episodes, device=options.device))
+    return {
+        "seed": result.options.seed,
+        "returns": [episode.reward for episode in result.episodes],
+        "lengths": [episode.length for episode in result.episodes],
+        "successes": [episode.success for episode in result.episodes],
+    }
+
+
+def main() -> int:
+    """
+    What the process does: the job comes on standard input.
+
+    :return: exit code
+    """
+    job = Job(**json.loads(sys.stdin.read()))
+    threading.Thread(target=_obey, args=(job.control,), daemon=True).start()
+    try:
+        return 0 if run_cell(job) else _STOPPED
+    except KeyboardInterrupt:
+        return _STOPPED
+    except ConfigError as error:
+        print(error)
+    except Exception as error:
+        traceback.print_exc()
+        sys.stderr.flush()
+        first_line = next(iter(str(error).splitlines()), "")
+        print(f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,494 @@
+"""
+``sb3-symphony bench``: all cells of a study, on one machine or many, and what came out.
+
+Results lie in one folder, which holds all that is needed to go on or to make the tables anew::
+
+    <folder>/study.yml                       the study
+    <folder>/settings/<algorithm>_<env>.yml  merged hyper-parameters of each variant
+    <folder>/<algorithm>/<env>_<seed>/       run folder of a cell, with result.json once it is done
+    <folder>/<algorithm>/<env>_<seed>.log    what its process printed
+    <folder>/cells.csv, episodes.csv, table.md, evaluations.png, training.png
+"""
+
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from sb3_symphony.experiment.cell import Control, Job, Outcome, read_result, supervise
+from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, parse_yaml, read_yaml
+from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.study import Cell, Environment, cells_of, configuration, read_study
+
+if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
+    from sb3_symphony.analysis.tables import Result
+    from sb3_symphony.experiment.backends import Backend
+
+#: seconds between two signs of life for the cells
+_BEAT = 10.0
+
+
+class BenchOptions(BaseModel):
+    """Options of ``sb3-symphony bench``; their meaning is in its ``--help``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    study: str
+    quick: bool = False
+    folder: str | None = None
+    backend: Literal["loky", "ray"] = "loky"
+    n_jobs: int | None = Field(default=None, ge=1)
+    address: str | None = None
+    report: bool = False
+    dry_run: bool = False
+
+
+State = Literal["queued", "running", "done", "failed", "stopped"]
+
+
+@dataclass
+class Progress:
+    """
+    How far a cell is.
+
+    :param cell: the cell
+    :param config: its merged configuration
+    :param run: its run folder
+    :param state: of its present execution
+    :param kept: whether it was done before
+    :param reason: why it failed
+    :param steps: environment steps at the end of its latest training episode
+    :param latest: mean return of the latest ten training episodes, None before the first
+    :param since: moment and steps when it was first seen running
+    """
+
+    cell: Cell
+    config: RunConfig
+    run: RunFolder
+    state: State = "queued"
+    kept: bool = False
+    reason: str = ""
+    steps: int = 0
+    latest: float | None = None
+    since: tuple[float, int] | None = None
+
+    @property
+    def total(self) -> int:
+        """Environment steps that it is to take."""
+        return self.config.settings.n_timesteps
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Until it is done, as far as that can be told yet."""
+        if self.since is None or self.steps <= self.since[1]:
+            return None
+        return (time.monotonic() - self.since[0]) / (self.steps - self.since[1]) * (self.total - self.steps)
+
+    def look(self) -> None:
+        """Read how far the run is, from its files: they are on a file system that all machines share."""
+        from sb3_symphony.analysis.runs import read_episodes
+
+        try:
+            episodes = read_episodes(self.run.path)
+        except ValueError:  # just being written
+            return
+        if episodes is not None and len(episodes.steps):
+            self.steps = min(int(episodes.steps[-1]), self.total)
+            self.latest = float(episodes.returns[-10:].mean())
+
+
+@dataclass(frozen=True)
+class BenchResult:
+    """
+    What became of a grid.
+
+    :param folder: where its results are
+    :param table: the Markdown tables; with ``dry_run``, what its cells are and how far
+    :param failed: cells that failed, and why
+    :param interrupted: whether it was stopped by a signal
+    :param untouched: whether nothing was to be run or written
+    """
+
+    folder: Path
+    table: str
+    failed: list[tuple[str, str]] = field(default_factory=list)
+    interrupted: bool = False
+    untouched: bool = False
+
+    def summary(self) -> str:
+        """:return: table, and failures, for the end of the command"""
+        if self.untouched:
+            return self.table
+        lines = [self.table]
+        lines += [f"failed: {name}: {reason} (see {self.folder / name}.log)" for name, reason in self.failed]
+        if self.interrupted:
+            lines.append(f"interrupted, saved in {self.folder} — the same command goes on")
+        else:
+            lines.append(f"results in {self.folder}")
+        return "\n".join(lines)
+
+
+def bench(options: BenchOptions) -> BenchResult:
+    """
+    Run the cells of a study that are not done yet, then write tables and figures of all that are.
+
+    :param options: options of the command line
+    :return: what became of it
+    :raises ConfigError: if the study is wrong, its folder holds other results, or the cluster cannot be used; nothing is
+        changed then
+    """
+    if options.address is not None and options.backend != "ray":
+        raise ConfigError(f"--address: '{options.address}' — is for --backend ray")
+    path = Path(options.study)
+    study = read_study(path, options.quick)
+    name = path.absolute().parent.name if path.stem == "study" else path.stem
+    folder = Path(options.folder or f"logs/bench/{name}{'_quick' if options.quick else ''}").absolute()
+    progress = [_standing(cell, folder) for cell in cells_of(study, path.absolute().parent)]
+    if options.dry_run:
+        from sb3_symphony.experiment.grid_view import plain_table
+
+        return BenchResult(folder, plain_table(progress), untouched=True)
+    if options.report:
+        if not any(each.run.path.is_dir() for each in progress):
+            raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
+        return BenchResult(folder, report(study.title or name, progress, folder))
+    return _run(options, study.title or name, progress, folder, path)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Before
+# ----------------------------------------------------------------------------------------------------------------------
+
+#: options of ``train`` that results depend on
+_DECISIVE = ("algo", "env", "seed", "eval_freq", "eval_episodes", "protocol", "threshold", "device")
+
+
+def _standing(cell: Cell, folder: Path) -> Progress:
+    """How far a cell is; what is there has to be of the same settings."""
+    config = configuration(cell)
+    run = RunFolder(folder / cell.name, RunFolder.file_name(cell.environment.id))
+    progress = Progress(cell, config, run)
+    if not (run.details / "args.yml").is_file():
+        return progress
+    _check_same(progress)
+    progress.look()
+    result = read_result(run.path)
+    done = result is not None and result["n_timesteps"] == progress.total
+    if done and len(result.get("final", {}).get("returns", [])) >= cell.final_episodes:  # type: ignore[union-attr]
+        progress.state, progress.kept, progress.steps = "done", True, progress.total
+    return progress
+
+
+def _check_same(progress: Progress) -> None:
+    """Refuse to mix runs of one study with those of another, or of the same one before it was changed."""
+    run, cell = progress.run, progress.cell
+    stored = {"options": read_yaml(run.details / "args.yml"), "config": read_yaml(run.details / "config.yml")}
+    options = {name: getattr(cell.options, name) for name in _DECISIVE}
+    if cell.options.protocol is not None:  # settles these; the threshold too, if none is given
+        for name in ("eval_freq", "eval_episodes", *(["threshold"] if cell.options.threshold is None else [])):
+            del options[name]
+    config = parse_yaml(yaml.safe_dump(progress.config.plain), "study")
+    pairs = [(name, stored["options"].get(name), value) for name, value in options.items()]
+    pairs += [(name, stored["config"].get(name), config.get(name)) for name in dict.fromkeys([*stored["config"], *config])]
+    for name, there, wanted in pairs:
+        if name == "n_timesteps":
+            if there is not None and there > wanted:
+                raise ConfigError(
+                    f"{cell.name}: has {there} steps, the study {wanted} — expected as many or more, or another -f"
+                )
+        elif there != wanted:
+            raise ConfigError(
+                f"{cell.name}: was trained with {name} {there!r}, the study has {wanted!r} — expected the same, or another -f"
+            )
+
+
+def _check_models(progress: Sequence[Progress]) -> None:
+    """Build each model once: whatever is wrong with algorithms, environments or settings shows before anything runs."""
+    from sb3_symphony.experiment.protocol import keep_protocol
+    from sb3_symphony.experiment.train import build_model
+
+    for each in {(p.cell.algorithm, p.cell.environment.id): p for p in progress if not p.kept}.values():
+        cell = each.cell
+        try:
+            model = build_model(cell.options, each.config, seed=0, verbose=0)
+            env = model.get_env()
+            assert env is not None
+            env.close()
+            keep_protocol(cell.options, each.config)
+        except ConfigError as error:
+            raise ConfigError(f"{cell.algorithm} on {cell.environment.id}: {error}") from None
+
+
+def _write_settings(progress: Sequence[Progress], folder: Path, study: Path) -> None:
+    """What the cells read. They may run on machines that have neither the study nor its files."""
+    settings = folder / "settings"
+    settings.mkdir(parents=True, exist_ok=True)
+    (folder / "study.yml").write_bytes(study.read_bytes())
+    for each in progress:
+        content = yaml.safe_dump(each.config.plain, sort_keys=False)
+        path = _settings_file(each, folder)
+        if not path.is_file() or path.read_text(encoding="utf-8") != content:
+            path.write_text(content, encoding="utf-8")
+
+
+def _settings_file(progress: Progress, folder: Path) -> Path:
+    return folder / "settings" / f"{progress.cell.algorithm}_{progress.run.env_name}.yml"
+
+
+def _job(progress: Progress, folder: Path, session: Path) -> Job:
+    """All settings come from one file, whose content was merged and checked here."""
+    merged = {"conf_file": str(_settings_file(progress, folder)), "hyperparams": {}, "env_kwargs": {}}
+    given = progress.cell.options.model_dump(include=progress.cell.options.model_fields_set)
+    options = TrainOptions(**{**given, **merged, "n_timesteps": progress.total, "log_folder": str(folder)})
+    return Job(
+        name=progress.cell.name,
+        options=options.model_dump(include=options.model_fields_set),
+        run=str(progress.run.path),
+        final_episodes=progress.cell.final_episodes,
+        session=str(session),
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Meanwhile
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    from filelock import FileLock, Timeout
+
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            yield
+    except Timeout:
+        raise ConfigError(f"-f: '{folder}' is being worked on by another process") from None
+
+
+def _run(options: BenchOptions, title: str, progress: list[Progress], folder: Path, study: Path) -> BenchResult:
+    from sb3_symphony.experiment.backends import open_backend
+    from sb3_symphony.experiment.output import output_folder
+
+    left = [each for each in progress if not each.kept]
+    interrupted = False
+    if left:
+        _check_models(left)
+        gpus = any(each.cell.options.device.startswith("cuda") for each in left)
+        backend = open_backend(options.backend, options.n_jobs, options.address, gpus)
+        try:
+            new = not folder.exists()
+            with _alone(output_folder(folder, "-f")):
+                session = _new_session(backend, folder, new)
+                _write_settings(progress, folder, study)
+                interrupted = _Session(progress, folder, session, backend).run()
+                shutil.rmtree(session)
+        finally:
+            backend.close()
+    failed = [(each.cell.name, each.reason) for each in progress if each.state == "failed"]
+    return BenchResult(folder, report(title, progress, folder), failed, interrupted)
+
+
+def _new_session(backend: "Backend", folder: Path, new: bool) -> Path:
+    """Folder of this execution, which all machines see."""
+    session = folder / ".session"
+    shutil.rmtree(session, ignore_errors=True)
+    session.mkdir()
+    try:
+        backend.check_folder(session)
+    except ConfigError:
+        shutil.rmtree(folder if new else session)
+        raise
+    return session
+
+
+class _Session:
+    """
+    One execution of a grid: workers in a thread, while the main one looks after display, signals and signs of life.
+
+    :param progress: all cells
+    :param folder: where results are kept
+    :param session: folder of this execution
+    :param backend: where to run them
+    """
+
+    def __init__(self, progress: list[Progress], folder: Path, session: Path, backend: "Backend") -> None:
+        self.progress = progress
+        self.left = {each.cell.name: each for each in progress if not each.kept}
+        self.jobs = [_job(each, folder, session) for each in self.left.values()]
+        self.control = Control(session / "control.json")
+        self.backend = backend
+        self.stop = 0  # how often that was asked for
+        self.ended: SimpleQueue[tuple[Job, Outcome | Exception]] = SimpleQueue()
+        self.error: Exception | None = None
+
+    def run(self) -> bool:
+        """
+        :return: whether it was stopped by a signal
+        """
+        from sb3_symphony.experiment.grid_view import View
+
+        self.control.say(0)
+        with self._listening(), View(self.progress) as view:
+            thread = threading.Thread(target=self._work, daemon=True)
+            thread.start()
+            said, beat = 0, time.monotonic()
+            while thread.is_alive():
+                thread.join(timeout=1.0)
+                if self.stop != said or time.monotonic() - beat >= _BEAT:
+                    said, beat = self.stop, time.monotonic()
+                    self.control.say(said)
+                self._look()
+                view.update(stopping=self.stop > 0)
+        if self.error is not None:
+            raise self.error
+        return self.stop > 0
+
+    @contextmanager
+    def _listening(self) -> Iterator[None]:
+        """Ctrl-C stops all cells, wherever they run; each saves what it has. A second one does not wait for that."""
+
+        def handle(signum: int, frame: Any) -> None:
+            self.stop += 1
+
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _work(self) -> None:
+        try:
+            for ended in self.backend.map(supervise, self.jobs):
+                self.ended.put(ended)
+        except Exception as error:  # raised again by the main thread
+            self.error = error
+
+    def _look(self) -> None:
+        """Take up what is new of each cell."""
+        for job in self.jobs:
+            each = self.left[job.name]
+            if each.state == "queued" and job.started.is_file():
+                each.state = "running"
+            if each.state == "running":
+                each.look()
+                if each.since is None:
+                    each.since = (time.monotonic(), each.steps)
+        while not self.ended.empty():
+            job, outcome = self.ended.get()
+            if isinstance(outcome, Exception):
+                outcome = Outcome("failed", f"its worker died — {type(outcome).__name__}")
+            elif outcome.state == "stopped" and not self.stop:
+                outcome = Outcome("failed", "was stopped by a signal from elsewhere")
+            each = self.left[job.name]
+            each.state, each.reason = outcome.state, outcome.reason
+            each.look()
+            if each.state == "done":
+                each.steps = each.total
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Afterwards
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def report(title: str, progress: Sequence[Progress], folder: Path) -> str:
+    """
+    Write tables and figures of what is there.
+
+    :param title: heading
+    :param progress: all cells of the study
+    :param folder: where their run folders are, and where to write
+    :return: the Markdown tables
+    :raises ConfigError: if a file of a run is damaged, or nothing can be written
+    """
+    from sb3_symphony.analysis.tables import as_csv, episode_rows, markdown_table, run_row
+    from sb3_symphony.common.checkpoint import write_atomically
+
+    try:
+        results = [_result(each) for each in progress]
+        by_environment = [
+            [each for each in results if each.environment == env]
+            for env in dict.fromkeys(each.environment for each in results)
+        ]
+        table = "\n".join([f"## {title}", "", *map(markdown_table, by_environment)])
+        files = {"cells.csv": as_csv(map(run_row, results)), "table.md": table}
+        if any(each.run is not None and each.run.episodes is not None for each in results):
+            files["episodes.csv"] = as_csv(episode_rows(results))
+        for name, content in files.items():
+            write_atomically(folder / name, content.encode())
+        _draw(by_environment, folder)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    except OSError as error:
+        raise ConfigError(f"'{error.filename or folder}' cannot be written — {error.strerror}") from None
+    return table
+
+
+def _result(progress: Progress) -> "Result":
+    from sb3_symphony.analysis.runs import open_run
+    from sb3_symphony.analysis.tables import Result
+
+    run, cell = progress.run, progress.cell
+    return Result(
+        cell.algorithm,
+        cell.environment.id,
+        cell.seed,
+        _thresholds(cell.environment),
+        open_run(run.path) if (run.details / "args.yml").is_file() else None,
+        read_result(run.path) if progress.state == "done" else None,
+    )
+
+
+def _thresholds(environment: Environment) -> Any:
+    from sb3_symphony.analysis.tables import Thresholds
+    from sb3_symphony.experiment.protocol import reward_threshold
+
+    solved = reward_threshold(environment.id) if environment.threshold is None else environment.threshold
+    below = environment.unstable_below
+    if below is None and solved is not None and solved > 0:
+        below = round(solved * 2 / 3, 6)
+    return Thresholds(solved, below)
+
+
+def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
+    """Learning curves of the runs that are done."""
+    from sb3_symphony.analysis.plots import episode_curve, evaluation_curve, plot_curves, summarised
+    from sb3_symphony.analysis.runs import NotRecorded, Run
+
+    def line(kind: str, run: Run) -> Any:
+        return evaluation_curve(run, "steps", "reward") if kind == "evaluations" else episode_curve(run, "steps", "reward", 20)
+
+    notes = {"evaluations": "mean of each evaluation's episodes", "training": "running mean of 20 training episodes"}
+    for kind, smoothed in notes.items():
+        panels: dict[str, list[Any]] = {}
+        for results in by_environment:
+            lines: dict[str, list[Any]] = {}
+            for each in results:
+                if each.run is None or each.summary is None:
+                    continue
+                try:
+                    x, y = line(kind, each.run)
+                except NotRecorded:
+                    continue
+                if len(x):
+                    lines.setdefault(each.algorithm, []).append((x, y))
+            if lines:
+                panels[results[0].environment] = [summarised(name, seeds) for name, seeds in lines.items()]
+        output = folder / f"{kind}.png"
+        if panels:
+            plot_curves(panels, "steps", "reward", smoothed, output)
+        else:
+            output.unlink(missing_ok=True)

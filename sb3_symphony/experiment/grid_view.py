@@ -1,0 +1,117 @@
+"""The cells of a grid while they run: a live table in a terminal, else a line for each change."""
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from sb3_symphony.experiment.grid import Progress
+
+
+_COLUMNS = ("cell", "state", "step", "return", "time left")
+_STYLES = {"running": "bold", "failed": "red", "queued": "dim", "stopped": "yellow", "done": "green"}
+
+
+def _time(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+
+
+def _cells(each: "Progress") -> list[str]:
+    state = each.state + " before" * each.kept
+    steps = f"{each.steps} / {each.total}"
+    left = each.seconds_left if each.state == "running" else None
+    return [each.cell.name, state, steps, "" if each.latest is None else f"{each.latest:.1f}", each.reason or _time(left)]
+
+
+def _counts(progress: "Sequence[Progress]") -> str:
+    counts = Counter(each.state for each in progress)
+    return ", ".join(
+        f"{counts[state]} {state}" for state in ("running", "queued", "done", "stopped", "failed") if counts[state]
+    )
+
+
+def plain_table(progress: "Sequence[Progress]") -> str:
+    """
+    :param progress: all cells
+    :return: state and steps of each, as text
+    """
+    rows = [_cells(each)[:4] for each in progress]
+    widths = [max(map(len, column)) for column in zip(_COLUMNS[:4], *rows, strict=True)]
+    lines = [
+        "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in (_COLUMNS[:4], *rows)
+    ]
+    return "\n".join([*lines, _counts(progress)])
+
+
+class View:
+    """
+    Shows cells while they run.
+
+    :param progress: all cells, changed from outside
+    """
+
+    def __init__(self, progress: "Sequence[Progress]") -> None:
+        self.progress = progress
+        self.console = Console(file=sys.stdout)
+        self.live = Live(console=self.console, auto_refresh=False) if self.console.is_terminal else None
+        self.told = {each.cell.name: "done" if each.kept else "queued" for each in progress}
+
+    def __enter__(self) -> "View":
+        if self.live is not None:
+            self.live.start()
+        else:
+            print(_counts(self.progress), flush=True)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        if self.live is not None:
+            self.live.stop()
+
+    def update(self, stopping: bool) -> None:
+        """
+        :param stopping: whether the cells are about to save and stop
+        """
+        if self.live is not None:
+            self.live.update(self._table(stopping), refresh=True)
+            return
+        for each in self.progress:
+            if self.told[each.cell.name] != each.state:
+                self.told[each.cell.name] = each.state
+                name, state, steps, latest, reason = _cells(each)
+                parts = [f"{state} {name}", f"step {steps}", *([f"return {latest}"] if latest else [])]
+                print(" | ".join([*parts, *([reason] if each.state == "failed" else [])]), flush=True)
+
+    def _table(self, stopping: bool) -> Table:
+        """Those that run first; as many of the others as there is room for."""
+        order = ("running", "failed", "stopped", "queued", "done")
+        shown = sorted(self.progress, key=lambda each: order.index(each.state))
+        room = max(self.console.height - 7, 5)
+        caption = _counts(self.progress) + self._left()
+        caption += " — saving and stopping (Ctrl-C again: at once)" if stopping else ""
+        table = Table(caption=caption, caption_justify="left")
+        for name, justify in zip(_COLUMNS, ("left", "left", "right", "right", "left"), strict=True):
+            options: Any = {"justify": justify, "no_wrap": name != "time left", "overflow": "ellipsis"}
+            table.add_column(name, **options)
+        for each in shown[:room]:
+            table.add_row(*_cells(each), style=_STYLES[each.state])
+        if len(shown) > room:
+            table.add_row(f"… {len(shown) - room} more", style="dim")
+        return table
+
+    def _left(self) -> str:
+        """Time that all cells together still need, by the speed of those that run."""
+        running = [each for each in self.progress if each.state == "running" and each.seconds_left is not None]
+        if not running:
+            return ""
+        speed = sum((each.total - each.steps) / max(each.seconds_left or 0, 1e-9) for each in running)  # steps / s
+        steps = sum(each.total - each.steps for each in self.progress if each.state in ("running", "queued"))
+        return f"; about {_time(steps / speed)} left" if speed > 0 else ""
