@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_symphony import REDQ, Symphony
@@ -390,6 +390,17 @@ def test_no_checkpoint_is_no_error(tmp_path):
 def test_bad_arguments(tmp_path, arguments):
     with pytest.raises((ValueError, TypeError), match=next(iter(arguments))):
         ExactCheckpoints(tmp_path, **{"save_freq": 10, **arguments})
+
+
+def test_what_cannot_be_recorded():
+    with pytest.raises(TypeError, match="expected a DummyVecEnv of environments with a Monitor"):
+        record_episodes(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+
+
+def test_buffer_that_was_not_empty(tmp_path, small, pendulum):
+    model = small(REDQ, pendulum()).learn(40)
+    with pytest.raises(ValueError, match="expected one that was empty at step 0"):
+        model.learn(40, callback=ExactCheckpoints(tmp_path, 30))
 
 
 def fresh(tmp_path, make, steps, at, capsys):

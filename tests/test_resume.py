@@ -122,8 +122,9 @@ def resume(run, **changes):
 
 
 def contents(folder):
-    """Every file with its content and time of change."""
-    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in Path(folder).rglob("*") if path.is_file()}
+    """Every file but the lock, with its content and time of change."""
+    files = (path for path in Path(folder).rglob("*") if path.is_file() and path.name != ".lock")
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -293,11 +294,11 @@ def test_killed_before_the_first_checkpoint(killed, capsys):
 @pytest.mark.parametrize("save_freq", [-1, 100])
 def test_finished_run_is_left_alone(capsys, save_freq):
     run = train(options(save_freq=save_freq)).run.path
-    before = contents(run)
+    before, locks = contents(run), [path.stat().st_mtime_ns for path in run.rglob(".lock")]
     for extra in ([], ["-n", "260"], ["-n", "100"], ["--algo", "td3", "--seed", "1"]):
         assert main(["train", "--resume", str(run), *extra]) == 0
         assert "is finished: 260 steps" in capsys.readouterr().out.splitlines()[-1]
-    assert contents(run) == before
+    assert contents(run) == before and [path.stat().st_mtime_ns for path in run.rglob(".lock")] == locks
 
 
 @pytest.mark.parametrize("algo", ["symphony", "sac", "ppo"])
@@ -350,10 +351,7 @@ def test_contradictions(killed, capsys, extra, message):
     assert main(["train", "--resume", str(run), *extra.split()]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-    assert contents(run).keys() - before.keys() <= {run / "checkpoints" / ".lock"}
-    assert {path: file for path, file in contents(run).items() if path.name != ".lock"} == {
-        path: file for path, file in before.items() if path.name != ".lock"
-    }
+    assert contents(run) == before
 
 
 def test_not_a_run(folder, capsys):
@@ -369,6 +367,16 @@ def test_run_without_checkpoints(monkeypatch, capsys):
     assert train(options(eval_freq=100, save_freq=-1)).interrupted
     assert main(["train", "--resume", "logs/td3/Pendulum-v1_1"]) == 2
     assert "has no checkpoints — it was started without --save-freq" in capsys.readouterr().err
+
+
+def test_checkpoints_that_were_deleted(folder, capsys):
+    run = train(options()).run.path
+    for path in (run / "checkpoints").glob("*0*"):
+        path.unlink()
+    before = contents(run)
+    assert main(["train", "--resume", str(run), "-n", "300"]) == 2
+    assert "has a model of 260 steps, but no checkpoint — start a new run" in capsys.readouterr().err
+    assert contents(run) == before
 
 
 def test_one_process_at_a_time(killed, capsys):
@@ -430,9 +438,7 @@ def test_no_checkpoint_is_whole(killed, capsys):
     assert main(["train", "--resume", str(run)]) == 2
     error = capsys.readouterr().err
     assert "no checkpoint of" in error and "checkpoint_000000100.ckpt: cut or changed" in error
-    assert {path: file for path, file in contents(run).items() if path.name != ".lock"} == {
-        path: file for path, file in before.items() if path.name != ".lock"
-    }
+    assert contents(run) == before
 
 
 def test_monitor_and_evaluations_are_what_they_were(killed):

@@ -164,7 +164,10 @@ class ReplaySegments:
         :param buffer: replay buffer
         :param rows: rows added to it since the run began
         :return: segments that together hold the whole buffer
+        :raises ValueError: if it held others already when the run began
         """
+        if (buffer.pos, buffer.full) != (rows % buffer.buffer_size, rows >= buffer.buffer_size):
+            raise ValueError(f"replay buffer: holds {buffer.size()} rows after {rows} — expected one that was empty at step 0")
         first = max(rows - buffer.buffer_size, 0)  # the oldest row still there
         start = max(self.saved, first)
         if start < rows:
@@ -407,10 +410,12 @@ def record_episodes(env: VecEnv) -> None:
     """
     Put :class:`RecordedEpisode` around each copy of an environment, so that checkpoints can hold its state.
 
-    :param env: environment whose copies are in this process and have a ``Monitor``
+    :param env: environment whose copies are in this process and have a ``Monitor``, as those of ``make_vec_env``
+    :raises TypeError: if it is another kind
     """
     copies = env.unwrapped
-    assert isinstance(copies, DummyVecEnv)
+    if not isinstance(copies, DummyVecEnv) or not all(copies.env_is_wrapped(Monitor)):
+        raise TypeError(f"record_episodes: {copies} — expected a DummyVecEnv of environments with a Monitor")
     copies.envs = [RecordedEpisode(copy) for copy in copies.envs]
 
 

@@ -47,12 +47,16 @@ class StoredRun:
     def checkpoint(self) -> Checkpoint | None:
         """
         :return: where to go on from; None if the run was stopped before its first checkpoint, and begins again
-        :raises ConfigError: if no checkpoint is whole, or it is beyond the end that is asked for
+        :raises ConfigError: if no checkpoint is whole, all are gone, or it is beyond the end that is asked for
         """
         try:
             checkpoint = newest_checkpoint(self.run.checkpoints)
         except DamagedCheckpoint as error:
             raise ConfigError(f"--resume: no checkpoint of '{self.run.path}' is whole — {error}") from None
+        if checkpoint is None and self.steps > 0:  # it had learned something, which must not be overwritten
+            raise ConfigError(
+                f"--resume: '{self.run.path}' has a model of {self.steps} steps, but no checkpoint — start a new run"
+            )
         if checkpoint is not None and checkpoint.steps >= self.config.settings.n_timesteps:
             n_timesteps = self.config.settings.n_timesteps
             raise ConfigError(f"-n: {n_timesteps} — the run has taken {checkpoint.steps} steps already, expected more")
