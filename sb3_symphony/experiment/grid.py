@@ -281,6 +281,7 @@ def _run(options: BenchOptions, title: str, progress: list[Progress], folder: Pa
     left = [each for each in progress if not each.kept]
     interrupted = False
     if left:
+        print(f"{len(left)} of {len(progress)} cells to do, into {folder}", flush=True)
         _check_models(left)
         gpus = any(each.cell.options.device.startswith("cuda") for each in left)
         backend = open_backend(options.backend, options.n_jobs, options.address, gpus)

@@ -68,8 +68,6 @@ class View:
     def __enter__(self) -> "View":
         if self.live is not None:
             self.live.start()
-        else:
-            print(_counts(self.progress), flush=True)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:

@@ -1,0 +1,439 @@
+"""``bench``: a real grid, on this machine and on a Ray cluster, interrupted, killed, spoiled and gone on with."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+from resume_helpers import assert_same_results
+from test_cli import fails
+
+from sb3_symphony.cli import main
+from sb3_symphony.experiment import cell as cell_module
+from sb3_symphony.experiment.cell import Control, Job, Outcome, supervise
+
+SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
+STUDY = {
+    "title": "Swing-up",
+    "algorithms": [
+        {"name": "td3", "overrides": SMALL},
+        {"name": "sac-2", "algo": "sac", "overrides": {**SMALL, "gradient_steps": 2}},
+    ],
+    "environments": [{"id": "Pendulum-v1", "threshold": -1200}],
+    "seeds": 3,
+    "steps": 450,
+    "save_freq": 100,
+    "final_episodes": 2,
+    "protocol": {"eval_freq": 150, "eval_episodes": 1},
+    "quick": {"algorithms": ["td3"], "seeds": 1, "steps": 220, "final_episodes": 0},
+}
+CELLS = sorted(f"{algorithm}/Pendulum-v1_{seed}" for algorithm in ("td3", "sac-2") for seed in range(3))
+
+CRASH = """
+import os, signal
+import gymnasium as gym
+
+class CrashEnv(gym.Env):
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        if self.spec.id == "Raise-v0":
+            raise RuntimeError("the motor is hot\\nsecond line")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+for name in ("Raise-v0", "Die-v0"):
+    if name not in gym.registry:
+        gym.register(name, entry_point=CrashEnv)
+"""
+
+
+def write_study(folder, **changes):
+    path = folder / "study.yml"
+    path.write_text(yaml.safe_dump({**STUDY, **changes}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Results of a grid that nothing has happened to."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert main(["bench", str(write_study(folder)), "-j", "2", "-f", str(folder / "results")]) == 0
+    return folder / "results"
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def done(results):
+    return sorted(str(path.parent.relative_to(results)) for path in results.glob("*/*/result.json"))
+
+
+def contents(*folders):
+    """Every file with its content and time of change."""
+    files = (path for folder in folders for path in sorted(Path(folder).rglob("*")) if path.is_file())
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+
+
+def assert_same_grid(a, b):
+    assert done(a) == done(b) == CELLS
+    for name in CELLS:
+        assert_same_results(a / name, b / name)
+        x, y = (json.loads((results / name / "result.json").read_text()) for results in (a, b))
+        for changing in ("seconds", "machine"):
+            del x[changing], y[changing]
+        assert x == y
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What comes out
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def test_results(whole):
+    assert done(whole) == CELLS
+    assert {path.name for path in whole.iterdir() if not path.name.startswith(".")} == {
+        *("cells.csv", "episodes.csv", "table.md", "evaluations.png", "training.png", "study.yml", "settings", "td3", "sac-2"),
+    }
+    run = whole / "sac-2" / "Pendulum-v1_1"
+    options = yaml.safe_load((run / "Pendulum-v1" / "args.yml").read_text())
+    assert (options["algo"], options["seed"], options["num_threads"], options["eval_freq"]) == ("sac", 1, 1, 150)
+    config = yaml.safe_load((run / "Pendulum-v1" / "config.yml").read_text())
+    assert config["n_timesteps"] == 450 and config["gradient_steps"] == 2 and config["policy_kwargs"] == {"net_arch": [8]}
+    result = json.loads((run / "result.json").read_text())
+    assert (result["steps"], result["updates"]) == (450, 2 * 400)
+    assert result["final"]["seed"] == 20_000 and len(result["final"]["returns"]) == 2
+    command = (run / "Pendulum-v1" / "command.txt").read_text()
+    assert "--algo sac --env Pendulum-v1 -n 450 --seed 1 -conf" in command and "--eval-freq 150" in command
+    table = (whole / "table.md").read_text()
+    assert table.startswith("## Swing-up\n\n### Pendulum-v1\n") and "| td3 (non-standard)" in table
+    rows = (whole / "cells.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(CELLS)
+    episodes = (whole / "episodes.csv").read_text().splitlines()
+    assert len(episodes) == 1 + len(CELLS) * (2 + 3 + 2)  # training, evaluations, at the end
+
+
+def test_a_cell_is_the_run_of_its_command(whole, folder):
+    run = whole / "td3" / "Pendulum-v1_2"
+    command = (run / "Pendulum-v1" / "command.txt").read_text().split()
+    assert main([*command[1:], "-f", "alone"]) == 0
+    assert_same_results(folder / "alone" / "td3" / "Pendulum-v1_1", run)
+
+
+def test_done_cells_stay_as_they_are_and_reports_are_made_anew(whole, folder, capsys):
+    study = str(whole.parent / "study.yml")
+    before = contents(*(whole / name for name in CELLS))
+    reports = {path: path.read_bytes() for path in whole.iterdir() if path.is_file()}
+    assert main(["bench", study, "-f", str(whole)]) == 0
+    out = capsys.readouterr().out
+    assert "cells to do" not in out and "### Pendulum-v1" in out and f"results in {whole}" in out
+    for path in reports:
+        if path.suffix in (".csv", ".md", ".png"):
+            path.unlink()
+    assert main(["bench", study, "-f", str(whole), "--report"]) == 0
+    assert {path: path.read_bytes() for path in reports} == reports
+    assert contents(*(whole / name for name in CELLS)) == before
+
+
+def test_raw_results_suffice_for_the_report(whole, folder):
+    for path in whole.rglob("*"):
+        if path.name in ("args.yml", "config.yml", "result.json", "0.monitor.csv", "evaluations.npz"):
+            copy = folder / "raw" / path.relative_to(whole)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+    assert main(["bench", str(whole.parent / "study.yml"), "-f", "raw", "--report"]) == 0
+    for name in ("cells.csv", "episodes.csv", "table.md", "evaluations.png", "training.png"):
+        assert (folder / "raw" / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_dry_run(whole, folder, capsys):
+    study = str(whole.parent / "study.yml")
+    assert main(["bench", study, "--dry-run"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + len(CELLS) and re.search(r"^td3/Pendulum-v1_0 +queued +0 / 450$", lines[1])
+    assert lines[-1] == "6 queued" and list(folder.iterdir()) == []
+    assert main(["bench", study, "--dry-run", "-f", str(whole)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "6 done"
+
+
+def test_quick_and_then_longer(folder, capsys):
+    study = write_study(folder)
+    assert main(["bench", str(study), "--quick"]) == 0
+    results = folder / "logs" / "bench" / f"{folder.name}_quick"
+    assert done(results) == ["td3/Pendulum-v1_0"]
+    assert "final" not in json.loads((results / "td3" / "Pendulum-v1_0" / "result.json").read_text())
+    quick = {**STUDY["quick"], "steps": 300, "final_episodes": 1}
+    assert main(["bench", str(write_study(folder, quick=quick)), "--quick"]) == 0
+    result = json.loads((results / "td3" / "Pendulum-v1_0" / "result.json").read_text())
+    assert result["steps"] == 300 and len(result["final"]["returns"]) == 1
+    assert "resumed at 220" in (results / "td3" / "Pendulum-v1_0.log").read_text()
+    capsys.readouterr()
+    before = contents(results)
+    message = fails(capsys, "bench", str(write_study(folder, quick={**quick, "steps": 250})), "--quick")
+    assert "td3/Pendulum-v1_0: has 300 steps, the study 250 — expected as many or more, or another -f" in message
+    assert contents(results) == before
+
+
+def test_a_changed_study_does_not_mix_with_old_results(whole, folder, capsys):
+    before = contents(whole)
+    changed = {**SMALL, "batch_size": 32}
+    study = write_study(folder, algorithms=[{"name": "td3", "overrides": changed}])
+    message = fails(capsys, "bench", str(study), "-f", str(whole))
+    assert "td3/Pendulum-v1_0: was trained with batch_size 16, the study has 32 — expected the same, or another -f" in message
+    study = write_study(folder, protocol={"eval_freq": 150, "eval_episodes": 3})
+    assert "eval_episodes 1, the study has 3" in fails(capsys, "bench", str(study), "-f", str(whole), "--report")
+    assert contents(whole) == before
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What happens to it
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def start(study, results):
+    """A grid in a process group of its own."""
+    command = [sys.executable, "-m", "sb3_symphony", "bench", str(study), "-j", "2", "-f", str(results)]
+    return subprocess.Popen(command, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def wait_for(condition, process):
+    while not condition():
+        assert process.poll() is None, process.communicate()[0]
+        time.sleep(0.05)
+
+
+def half_done(results):
+    """Whether a cell that is not done has made a checkpoint."""
+    with_checkpoint = {str(path.parents[1].relative_to(results)) for path in results.glob("*/*/checkpoints/*.ckpt")}
+    return with_checkpoint - set(done(results))
+
+
+def test_interrupted_and_killed(whole, folder):
+    """Ctrl-C, then ``kill -9`` of all its processes: what is done stays as it is, the rest goes on, bit for bit."""
+    results = folder / "results"
+    process = start(whole.parent / "study.yml", results)
+    wait_for(lambda: half_done(results), process)
+    os.killpg(process.pid, signal.SIGINT)
+    out = process.communicate()[0]
+    assert process.returncode == 130 and "the same command goes on" in out and "Traceback" not in out, out
+    assert len(done(results)) < len(CELLS) and not (results / ".session").exists()
+
+    first = done(results)
+    process = start(whole.parent / "study.yml", results)
+    wait_for(lambda: len(done(results)) > len(first) and half_done(results), process)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    finished = done(results)
+    assert len(finished) < len(CELLS)
+    before = contents(*(results / name for name in finished))
+
+    assert main(["bench", str(whole.parent / "study.yml"), "-j", "2", "-f", str(results)]) == 0
+    assert contents(*(results / name for name in finished)) == before
+    assert_same_grid(results, whole)
+
+
+def test_a_failed_cell_stops_nothing(folder, monkeypatch, capsys):
+    (folder / "crash.py").write_text(CRASH)
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.syspath_prepend(folder)
+    environments = [{"id": "crash:Raise-v0"}, {"id": "crash:Die-v0"}, "Pendulum-v1"]
+    study = write_study(folder, environments=environments, algorithms=STUDY["algorithms"][:1], seeds=1, steps=210)
+    assert main(["bench", str(study), "-j", "1", "-f", "results"]) == 1
+    out = capsys.readouterr().out
+    assert "failed: td3/Raise-v0_0: RuntimeError: the motor is hot (see" in out
+    assert "failed: td3/Die-v0_0: its process was ended by SIGKILL (out of memory?)" in out
+    assert "- not done, and not in these numbers: td3 0" in out
+    assert done(folder / "results") == ["td3/Pendulum-v1_0"]
+    assert "Traceback" in (folder / "results" / "td3" / "Raise-v0_0.log").read_text()
+
+
+def test_two_at_once_are_refused(whole, folder, capsys):
+    from filelock import FileLock
+
+    study = write_study(folder, seeds=4)
+    with FileLock(whole / ".lock"):
+        assert "is being worked on by another process" in fails(capsys, "bench", str(study), "-f", str(whole))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Workers
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def job(folder):
+    options = {"algo": "td3", "env": "Pendulum-v1", "n_timesteps": 10**6, "seed": 0, "save_freq": 100, "hyperparams": SMALL}
+    options |= {"num_threads": 1, "eval_freq": 0, "verbose": 0, "progress": False}
+    (folder / "session").mkdir()
+    job = Job("td3/x", options, str(folder / "td3" / "x"), 0, str(folder / "session"))
+    job.control.say(0)
+    return job
+
+
+def test_nothing_begins_after_a_stop(job):
+    job.control.say(1)
+    assert supervise(job) == Outcome("queued")
+    assert not job.started.exists() and not job.log.exists()
+
+
+def test_a_cell_whose_worker_dies_does_not_go_on(job):
+    """Else it would be in the way of the next worker that is to go on with it."""
+    code = f"from sb3_symphony.experiment.cell import *; supervise(Job(**{vars(job)!r}))"
+    worker = subprocess.Popen([sys.executable, "-c", code])
+    wait_for(lambda: list(Path(job.run).glob("checkpoints/*.ckpt")), worker)
+    children = Path(f"/proc/{worker.pid}/task/{worker.pid}/children").read_text().split()
+    assert len(children) == 1
+    worker.kill()
+    worker.wait()
+    deadline = time.monotonic() + 60
+    while Path(f"/proc/{children[0]}").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{children[0]}").exists()
+
+
+def test_a_cell_saves_and_stops_when_nobody_is_left_to_tell(job, monkeypatch):
+    """As if the machine of the one who started the grid had gone: no sign of life any more."""
+    code = (
+        "from sb3_symphony.experiment import cell; cell.PATIENCE = 1.0; import sys; sys.stdin = open(0); sys.exit(cell.main())"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], input=json.dumps(vars(job)), text=True, capture_output=True)
+    assert ended.returncode in (cell_module._STOPPED, -signal.SIGTERM), ended.stderr  # the latter while still importing
+
+
+def test_reading_while_it_is_written(folder):
+    control = Control(folder / "control.json")
+    assert control.heard() is None
+    control.say(0)
+    control.say(2)
+    assert control.heard() == {"beat": 2, "stop": 2}
+    control.path.write_text('{"beat')
+    assert control.heard() is None
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Ray
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """A Ray cluster of two machines, with a core each, on this one."""
+    pytest.importorskip("ray", reason="ray is not installed")
+    from ray.cluster_utils import Cluster
+
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    memory = {"object_store_memory": 80 * 2**20}
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False, **memory})
+    cluster.add_node(num_cpus=1, **memory)
+    yield cluster
+    cluster.shutdown()
+
+
+def test_ray_gives_the_same_results(whole, cluster, folder):
+    study = str(whole.parent / "study.yml")
+    assert main(["bench", study, "--backend", "ray", "--address", cluster.address, "-f", str(folder / "results")]) == 0
+    assert_same_grid(folder / "results", whole)
+    results = [json.loads((folder / "results" / name / "result.json").read_text()) for name in CELLS]
+    assert len(results) == 6
+
+
+def test_a_folder_that_is_not_shared_is_refused(cluster, folder, capsys):
+    # Each process has another one of that name
+    study = write_study(folder)
+    argv = ["bench", str(study), "--backend", "ray", "--address", cluster.address, "-f", "/proc/self/cwd/results"]
+    assert "does not see '/proc/self/cwd/results/.session' — expected a folder that all machines share" in fails(capsys, *argv)
+    assert [path.name for path in folder.iterdir()] == ["study.yml"]
+
+
+def test_a_worker_of_ray_that_dies_is_replaced(cluster, folder):
+    from sb3_symphony.experiment.backends import open_backend
+
+    backend = open_backend("ray", address=cluster.address)
+    try:
+        results = dict(backend.map(die_once, [str(folder / "a"), str(folder / "b")]))
+    finally:
+        backend.close()
+    assert results == {str(folder / "a"): "second time", str(folder / "b"): "second time"}
+
+
+def die_once(path):
+    if Path(path).exists():
+        return "second time"
+    Path(path).touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_of_loky_that_dies_is_replaced(folder):
+    from sb3_symphony.experiment.backends import open_backend
+
+    backend = open_backend("loky", n_jobs=2)
+    try:
+        results = dict(backend.map(die_once, [str(folder / name) for name in "abc"]))
+        assert results == {str(folder / name): "second time" for name in "abc"}
+        (_, error) = next(iter(backend.map(die_always, [0])))
+        assert isinstance(error, Exception)
+    finally:
+        backend.close()
+
+
+def die_always(item):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Mistakes
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"environments": ["Pendulum-v2"]}, "td3 on Pendulum-v2: unknown environment 'Pendulum-v2'"),
+        ({"environments": ["Pendulum-v1", "BipedlWalker-v3"]}, "did you mean 'BipedalWalker-v3'?"),
+        ({"algorithms": [{"name": "td3", "overrides": {"gama": 1}}]}, "unknown hyper-parameter 'gama' for td3: did you mean"),
+        ({"algorithms": [{"name": "td3", "conf": "nothing.yml"}]}, "nothing.yml: no such file"),
+        ({"protocol": "standard", "environments": [{"id": "Pendulum-v1", "env_kwargs": {"g": 9.0}}]}, "env_kwargs: 'g'"),
+        ({"device": "tpu"}, "'tpu'"),
+        ({"sead": 3}, "unknown option 'sead': did you mean 'seeds'?"),
+    ],
+)
+def test_mistakes_in_a_study_leave_nothing(folder, capsys, changes, message):
+    study = write_study(folder, **changes)
+    assert message in fails(capsys, "bench", str(study))
+    assert [path.name for path in folder.iterdir()] == ["study.yml"]
+
+
+def test_other_mistakes_leave_nothing(folder, capsys):
+    study = str(write_study(folder))
+    assert "nothing.yml: no such file — expected a YAML file of a study" in fails(capsys, "bench", "nothing.yml")
+    assert "--report: no results in" in fails(capsys, "bench", study, "--report")
+    assert "--address: 'auto' — is for --backend ray" in fails(capsys, "bench", study, "--address", "auto")
+    assert "n_jobs: 0 — expected" in fails(capsys, "bench", study, "-j", "0")
+    assert "unknown backend 'dask'" in fails(capsys, "bench", study, "--backend", "dask")
+    assert "-f: 'study.yml/results' cannot be written" in fails(capsys, "bench", study, "-f", "study.yml/results").replace(
+        f"{folder}/", ""
+    )
+    assert [path.name for path in folder.iterdir()] == ["study.yml"]
+
+
+def test_an_address_where_nobody_answers(folder, capsys):
+    pytest.importorskip("ray", reason="ray is not installed")
+    study = str(write_study(folder, seeds=1))
+    ray = ["bench", study, "--backend", "ray", "--address"]
+    assert "nobody answers at '127.0.0.1:1' — Connection refused" in fails(capsys, *ray, "127.0.0.1:1")
+    assert "'ray://127.0.0.1:1' — Connection refused" in fails(capsys, *ray, "ray://127.0.0.1:1")
+    assert "'nonsense' — expected auto, HOST:PORT or ray://HOST:PORT" in fails(capsys, *ray, "nonsense")
+    assert [path.name for path in folder.iterdir()] == ["study.yml"]

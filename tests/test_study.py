@@ -1,0 +1,145 @@
+"""Study files: what their cells are, and one clear line for every mistake."""
+
+import pytest
+import yaml
+
+from sb3_symphony.experiment.config import ConfigError, shipped_folder
+from sb3_symphony.experiment.study import cells_of, configuration, read_study
+
+SMALL = {
+    "algorithms": ["td3", {"name": "sac-small", "algo": "sac", "overrides": {"policy_kwargs.net_arch": [8]}, "steps": 70}],
+    "environments": ["Pendulum-v1", {"id": "BipedalWalker-v3", "steps": 50}],
+    "seeds": 2,
+    "steps": 60,
+}
+
+
+@pytest.fixture
+def write(tmp_path):
+    def to_file(**changes):
+        path = tmp_path / "study.yml"
+        path.write_text(yaml.safe_dump({**SMALL, **changes}))
+        return path
+
+    return to_file
+
+
+def test_every_combination_is_a_cell(write, tmp_path):
+    cells = cells_of(read_study(write()), tmp_path)
+    assert [cell.name for cell in cells] == [
+        f"{algorithm}/{env}_{seed}"
+        for seed in (0, 1)
+        for env in ("Pendulum-v1", "BipedalWalker-v3")
+        for algorithm in ("td3", "sac-small")
+    ]
+    assert [cell.options.n_timesteps for cell in cells[:4]] == [60, 70, 50, 70]  # the algorithm's, else the environment's
+    options = cells[1].options
+    assert (options.algo, options.env, options.seed) == ("sac", "Pendulum-v1", 0)
+    assert (options.protocol, options.num_threads, options.device, options.save_freq) == ("standard", 1, "cpu", 10_000)
+    assert configuration(cells[1]).plain["policy_kwargs"]["net_arch"] == [8]
+    assert configuration(cells[1]).settings.n_timesteps == 70
+
+
+def test_steps_of_the_configuration(write, tmp_path):
+    (cell,) = cells_of(read_study(write(algorithms=["td3"], environments=["Pendulum-v1"], seeds=[7], steps=None)), tmp_path)
+    assert cell.seed == 7 and configuration(cell).settings.n_timesteps == 20_000
+
+
+def test_own_protocol_and_numbers(write, tmp_path):
+    study = read_study(write(protocol={"eval_freq": 1e3, "eval_episodes": 3}, device="cpu", save_freq=20, final_episodes=0))
+    cell = cells_of(study, tmp_path)[0]
+    assert (cell.options.protocol, cell.options.eval_freq, cell.options.eval_episodes) == (None, 1000, 3)
+    assert (cell.options.save_freq, cell.final_episodes) == (20, 0)
+
+
+def test_settings_beside_the_study_and_presets(write, tmp_path, monkeypatch):
+    monkeypatch.chdir("/")
+    (tmp_path / "own.yml").write_text("n_timesteps: 123\nlearning_starts: 17\n")
+    algorithms = [
+        {"name": "own", "algo": "td3", "conf": "own.yml"},
+        {"name": "original", "algo": "symphony", "conf": "symphony-original"},
+    ]
+    own, original = cells_of(read_study(write(algorithms=algorithms, seeds=[0], environments=["Pendulum-v1"])), tmp_path)
+    assert configuration(own).arguments == {"learning_starts": 17}
+    preset = yaml.safe_load((shipped_folder() / "presets" / "symphony-original.yml").read_text())
+    assert preset and configuration(original).arguments
+
+
+def test_quick(write, tmp_path):
+    quick = {
+        "algorithms": ["sac-small"],
+        "environments": ["Pendulum-v1"],
+        "seeds": [5],
+        "steps": 30,
+        "protocol": {"eval_freq": 10},
+        "final_episodes": 2,
+        "overrides": {"learning_starts": 5},
+    }
+    path = write(quick=quick)
+    assert len(read_study(path).algorithms) == 2
+    (cell,) = cells_of(read_study(path, quick=True), tmp_path)
+    assert cell.name == "sac-small/Pendulum-v1_5" and cell.final_episodes == 2
+    assert (cell.options.n_timesteps, cell.options.eval_freq, cell.options.protocol) == (30, 10, None)
+    plain = configuration(cell).plain
+    assert plain["learning_starts"] == 5 and plain["policy_kwargs"]["net_arch"] == [8]
+    rest = cells_of(read_study(write(quick={"seeds": 1}), quick=True), tmp_path)
+    assert [cell.options.n_timesteps for cell in rest] == [60, 70, 50, 70]
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"seed": 3}, "unknown option 'seed': did you mean 'seeds'?"),
+        ({"seeds": []}, "seeds: [] — expected at least one"),
+        ({"seeds": 0}, "seeds: 0 — expected at least one"),
+        ({"seeds": [1, 2, 1]}, "seeds: 1 is there 2 times — expected every cell once"),
+        ({"seeds": [-1]}, "seeds: [-1] — expected a number >= 0"),
+        ({"seeds": "many"}, "seeds: 'many' — expected a list"),
+        ({"steps": 0}, "steps: 0 — expected a number >= 1"),
+        ({"algorithms": []}, "algorithms: [] — expected at least one"),
+        ({"algorithms": ["td3", "td3"]}, "algorithms: 'td3' is there 2 times"),
+        ({"algorithms": ["td3", {"name": "TD3", "algo": "td3"}]}, "algorithms: 'td3' is there 2 times"),
+        ({"algorithms": ["tdd3"]}, "unknown algorithm 'tdd3': did you mean 'td3'?"),
+        ({"algorithms": [{"name": "x", "algo": "sacc"}]}, "unknown algorithm 'sacc': did you mean 'sac'?"),
+        ({"algorithms": [{"name": "x", "override": {}}]}, "algorithms: unknown option 'override': did you mean 'overrides'?"),
+        ({"algorithms": [{"name": "a/b", "algo": "td3"}]}, "algorithms: name: 'a/b' — expected letters"),
+        ({"algorithms": [{"algo": "td3"}]}, "algorithms: name: missing"),
+        ({"algorithms": [3]}, "algorithms: 3 — expected a name, or a mapping with 'name'"),
+        ({"environments": ["a:B/C-v1", "B-C-v1"]}, "environments: 'B-C-v1' is there 2 times"),
+        ({"environments": [{"id": "X", "treshold": 1}]}, "environments: unknown option 'treshold': did you mean 'threshold'?"),
+        ({"protocol": "standart"}, "protocol: 'standart' — expected standard, or a mapping"),
+        ({"protocol": {"eval_freq": -1}}, "protocol: eval_freq: -1 — expected a number >= 0"),
+        ({"quick": {"algoritms": []}}, "quick: unknown option 'algoritms': did you mean 'algorithms'?"),
+    ],
+)
+def test_mistakes(write, changes, message):
+    with pytest.raises(ConfigError) as error:
+        read_study(write(**changes))
+    assert message in str(error.value) and "\n" not in str(error.value) and "study.yml" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "quick, message",
+    [
+        (None, "quick: missing — expected what differs"),
+        ({"algorithms": ["sac-smal"]}, "quick: algorithms: unknown name 'sac-smal': did you mean 'sac-small'?"),
+        ({"environments": ["q"]}, "quick: environments: unknown name 'q' — expected some of Pendulum-v1, BipedalWalker-v3"),
+        ({"algorithms": []}, "quick: algorithms: [] — expected at least one"),
+    ],
+)
+def test_mistakes_of_the_quick_version(write, quick, message):
+    path = write() if quick is None else write(quick=quick)
+    with pytest.raises(ConfigError) as error:
+        read_study(path, quick=True)
+    assert message in str(error.value)
+
+
+def test_no_study_file(tmp_path):
+    with pytest.raises(ConfigError, match=r"nothing.yml: no such file — expected a YAML file of a study"):
+        read_study(tmp_path / "nothing.yml")
+
+
+def test_objects_are_not_built(tmp_path):
+    (tmp_path / "study.yml").write_text("algorithms: !!python/object/apply:os.system [echo]\n")
+    with pytest.raises(ConfigError, match=r"tag '!!python/object/apply:os\.system' refused"):
+        read_study(tmp_path / "study.yml")
