@@ -1,0 +1,195 @@
+"""What a study has found: a table of its trials, the best configuration, and Optuna's figures."""
+
+import csv
+import io
+import json
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import yaml
+from optuna.trial import FrozenTrial, TrialState
+
+from sb3_symphony.common.checkpoint import write_atomically
+from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge
+from sb3_symphony.experiment.space import parse_space
+from sb3_symphony.experiment.sweep_storage import WORKER
+
+#: attribute of a study: what all its trials have in common
+PLAN = "plan"
+#: attributes of a trial: why it failed, in words; how it ended (see ``TrialFailed``); last mean return of each seed
+REASON, ENDED, RETURNS = "reason", "ended", "returns"
+
+_FIGURES = ("optimization_history", "intermediate_values", "param_importances", "slice", "parallel_coordinate", "timeline")
+
+
+def reason_of(trial: FrozenTrial) -> str:
+    """
+    :param trial: a trial
+    :return: why it failed, ``""`` if it did not
+    """
+    return trial.user_attrs.get(REASON, "its process died") if trial.state == TrialState.FAIL else ""
+
+
+def replaced(trials: list[FrozenTrial]) -> set[int]:
+    """
+    :param trials: all trials of a study
+    :return: numbers of those that were enqueued again
+    """
+    return {number for trial in trials for number in trial.system_attrs.get("retry_history", ())}
+
+
+def ranked(trials: list[FrozenTrial]) -> list[FrozenTrial]:
+    """
+    :param trials: trials of a study
+    :return: those that completed, the best first, the earliest of equals before the others
+    """
+    completed = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    return sorted(completed, key=lambda trial: (-trial.values[0], trial.number))
+
+
+def best_of(trials: list[FrozenTrial]) -> FrozenTrial | None:
+    """
+    :param trials: trials of a study
+    :return: the best one, None if none has completed
+    """
+    return next(iter(ranked(trials)), None)
+
+
+class SweepReport:
+    """
+    Results of a study, as they are at the moment of each call.
+
+    :param study: the study
+    :param folder: where files are written
+    """
+
+    def __init__(self, study: optuna.Study, folder: Path) -> None:
+        self.study = study
+        self.folder = folder
+        self.plan: dict[str, Any] = study.user_attrs[PLAN]
+        self.space = parse_space(self.plan["space"], study.study_name)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """:return: a row for each trial, the same columns in all"""
+        rows = []
+        for trial in self.study.get_trials(deepcopy=False):
+            retries = trial.system_attrs.get("retry_history", [])
+            returns = trial.user_attrs.get(RETURNS, [])
+            row = {
+                "number": trial.number,
+                "state": trial.state.name.lower(),
+                "value": trial.value,
+                "reason": reason_of(trial),
+                "retry_of": retries[-1] if retries else None,
+                "evaluations": len(trial.intermediate_values),
+                "started": trial.datetime_start,
+                "seconds": trial.duration.total_seconds() if trial.duration else None,
+                "worker": trial.user_attrs.get(WORKER),
+            }
+            row |= dict(zip((f"seed_{seed}" for seed in self.plan["seeds"]), returns, strict=False))
+            rows.append({**row, **{name: _cell(value) for name, value in self.space.values(trial.params).items()}})
+        columns = list(dict.fromkeys(column for row in rows for column in row))
+        return [{column: row.get(column) for column in columns} for row in rows]
+
+    def configuration(self, trial: FrozenTrial) -> dict[str, Any]:
+        """
+        :param trial: a trial
+        :return: all hyper-parameters it was trained with, as plain values that ``-conf`` reads
+        """
+        values = self.space.values(trial.params)
+        options = TrainOptions(algo=self.plan["algo"], env=self.plan["env"], hyperparams=values)
+        return merge(self.plan["configuration"], options).plain
+
+    def write(self) -> None:
+        """
+        Write ``trials.csv`` and, if a trial has completed, ``best.yml`` and figures.
+
+        :raises ConfigError: if they cannot be written
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            rows = self.rows()
+            if rows:
+                table = io.StringIO()
+                writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
+                write_atomically(self.folder / "trials.csv", table.getvalue().encode())
+            best = best_of(self.study.get_trials(deepcopy=False))
+            if best is not None:
+                write_atomically(self.folder / "best.yml", self._best_yaml(best).encode())
+                self._draw()
+        except OSError as error:
+            raise ConfigError(f"--log-folder: '{self.folder}' cannot be written — {error.strerror}") from None
+
+    def _best_yaml(self, best: FrozenTrial) -> str:
+        plan = self.plan
+        completed = self._count(TrialState.COMPLETE)
+        lines = [
+            f"Trial {best.number} of the study '{self.study.study_name}', the best of {completed} that completed:",
+            f"mean return {best.value:.2f} of {plan['eval_episodes']} episodes for each of the seeds {plan['seeds']}.",
+            f"sb3-symphony train --algo {plan['algo']} --env {plan['env']} -conf {self.folder / 'best.yml'}",
+        ]
+        text = yaml.safe_dump(self.configuration(best), sort_keys=False, allow_unicode=True)
+        return "".join(f"# {line}\n" for line in lines) + text
+
+    def _count(self, *states: TrialState) -> int:
+        return len(self.study.get_trials(deepcopy=False, states=states))
+
+    def _draw(self) -> None:
+        if self._count(TrialState.COMPLETE) < 2:
+            return  # nothing to compare
+        import matplotlib
+
+        matplotlib.use("Agg")  # Optuna draws by pyplot, which else would look for a display
+        import matplotlib.pyplot as plt
+        from optuna.visualization import matplotlib as drawings
+
+        for name in _FIGURES:
+            with plt.rc_context(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of axes with a single value, and that the module is experimental
+                axes = getattr(drawings, f"plot_{name}")(self.study)
+                figure = np.ravel(axes)[0].get_figure()
+                image = io.BytesIO()
+                figure.savefig(image, dpi=120, bbox_inches="tight")
+                plt.close(figure)
+            write_atomically(self.folder / f"{name}.png", image.getvalue())
+
+    def summary(self) -> str:
+        """:return: state, best trials and where the files are, for the terminal"""
+        trials = self.study.get_trials(deepcopy=False)
+        again = replaced(trials)
+        counts = Counter(trial.state for trial in trials)
+        words = {
+            TrialState.COMPLETE: "completed",
+            TrialState.PRUNED: "pruned",
+            TrialState.FAIL: "failed",
+            TrialState.RUNNING: "running",
+            TrialState.WAITING: "waiting",
+        }
+        states = ", ".join(f"{counts[state]} {word}" for state, word in words.items() if counts[state]) or "none"
+        lines = [f"{self.study.study_name}: {len(trials)} trials ({states}; {len(again)} of them tried again)"]
+        lines[0] = lines[0] if again else lines[0].replace("; 0 of them tried again", "")
+        reasons = Counter(reason_of(trial) for trial in trials if trial.state == TrialState.FAIL)
+        lines += [f"  failed {count} ×: {reason}" for reason, count in reasons.most_common(5)]
+        best = ranked(trials)
+        if not best:
+            return "\n".join([*lines, "no trial has completed yet"])
+        names = list(best[0].params)
+        table = [["trial", "value", *names]]
+        table += [[str(t.number), f"{t.value:.2f}", *(_short(t.params.get(name)) for name in names)] for t in best[:5]]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
+        return "\n".join([*lines, f"best: trial {best[0].number}, {best[0].value:.2f} | {self.folder / 'best.yml'}"])
+
+
+def _cell(value: Any) -> Any:
+    return json.dumps(value) if isinstance(value, list | dict) else value
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
