@@ -26,6 +26,7 @@ from sb3_symphony.experiment.select import (
     SelectOptions,
     VideoOptions,
 )
+from sb3_symphony.experiment.space import TuneOptions
 
 _TRAIN_EXAMPLES = """examples:
   sb3-symphony train                                  Symphony learns to walk
@@ -57,6 +58,12 @@ _VIDEO_EXAMPLES = """examples:
 _GAIT_EXAMPLES = """examples:
   sb3-symphony gait                                    the latest run of Symphony on BipedalWalker-v3
   sb3-symphony gait logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 -o gaits.svg
+"""
+_TUNE_EXAMPLES = """examples:
+  sb3-symphony tune --algo td3 --n-trials 200 --n-jobs 2
+  sb3-symphony tune --algo ppo --env Pendulum-v1 -n 50000 --seeds-per-trial 2 -params gamma:0.9
+  sb3-symphony tune --storage postgresql://me@database.lab/sweeps --n-jobs 4     the same on each machine
+  sb3-symphony tune --show
 """
 _BENCH_EXAMPLES = """examples:
   sb3-symphony bench benchmarks/studies/bipedalwalker/study.yml --quick
@@ -391,6 +398,58 @@ def _plot(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     return 0
 
 
+def _add_tune(commands: Any) -> None:
+    parser = commands.add_parser(
+        "tune",
+        help="search for hyper-parameters",
+        usage="%(prog)s [--algo ALGO] [--env ENV] [options]",
+        description="Search for hyper-parameters, or go on with a search; files go to <log-folder>/<algo>/tune/<study>/.",
+        epilog=_TUNE_EXAMPLES,
+    )
+    add = partial(parser.add_argument, default=argparse.SUPPRESS)
+    default = TuneOptions()
+    add("--algo", metavar="ALGO", help=f"one of those of list (default: {default.algo})")
+    add("--env", metavar="ID", help=f"registered environment (default: {default.env})")
+    add("-n", "--n-timesteps", type=_whole_number, metavar="N", help="steps of each training (default: the configuration's)")
+    add("--n-trials", type=_whole_number, metavar="N", help=f"trials of the whole study (default: {default.n_trials})")
+    add("--n-startup-trials", type=_whole_number, metavar="N", help=f"random ones (default: {default.n_startup_trials})")
+    add("--n-evaluations", type=_whole_number, metavar="N", help=f"in each training (default: {default.n_evaluations})")
+    add("--eval-episodes", type=_whole_number, metavar="N", help=f"of an evaluation (default: {default.eval_episodes})")
+    seeds = f"seeds N, N + 1, … of every trial (default: {default.seed})"
+    add("--seed", type=_whole_number, metavar="N", help=seeds)
+    add("--seeds-per-trial", type=_whole_number, metavar="N", help=f"how many (default: {default.seeds_per_trial})")
+    add("--n-jobs", type=_whole_number, metavar="N", help="trials at a time, -1: as many as there are cores for (default: 1)")
+    add("--timeout", type=float, metavar="SECONDS", help="begin no trial after that time (default: none)")
+    add("--sampler", choices=("tpe", "random", "gp", "cmaes"), help=f"(default: {default.sampler})")
+    add("--pruner", choices=("median", "halving", "hyperband", "none"), help=f"(default: {default.pruner})")
+    add("--space", metavar="FILE", help="YAML file of the search space (default: shipped)")
+    add("-params", "--hyperparams", nargs="+", metavar="K:V", help="fix hyper-parameters; values are YAML")
+    add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset with all that is not searched (default: shipped)")
+    add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
+    add("-f", "--log-folder", metavar="DIR", help=f"where files are kept (default: {default.log_folder})")
+    add("--storage", metavar="WHERE", help="journal file or postgresql:// URL (default: a journal with the files)")
+    add("--study-name", metavar="NAME", help="name of the study (default: <algo>-<env>)")
+    add("--heartbeat", type=_whole_number, metavar="S", help=f"seconds between signs of life (default: {default.heartbeat})")
+    add("--device", help=f"auto, cpu or cuda (default: {default.device})")
+    add("--num-threads", type=_whole_number, metavar="N", help="threads of each training (default: share of the cores)")
+    add("--show", action="store_true", help="only print what a study has found so far, and write its files")
+    parser.set_defaults(run=_tune, parser=parser)
+
+
+def _tune(arguments: dict[str, Any], argv: Sequence[str]) -> int:
+    for name, flag in (("hyperparams", "-params"), ("env_kwargs", "--env-kwargs")):
+        if name in arguments:
+            arguments[name] = parse_pairs(arguments[name], flag)
+    options = validated(TuneOptions, arguments)
+    check_algorithm(options.algo)  # before the slow imports
+
+    from sb3_symphony.experiment.tune import tune
+
+    result = tune(options)
+    print(result.summary)
+    return 130 if result.interrupted else 0
+
+
 def _add_bench(commands: Any) -> None:
     parser = commands.add_parser(
         "bench",
@@ -453,6 +512,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_enjoy(commands)
     _add_evaluate(commands)
     _add_export(commands)
+    _add_tune(commands)
     _add_plot(commands)
     _add_video(commands)
     _add_gait(commands)
