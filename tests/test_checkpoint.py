@@ -3,6 +3,7 @@
 import io
 import os
 import pickle
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -192,7 +193,7 @@ def test_replayed_episode_goes_on_alike(env_id, steps):
         return seen
 
     go_on(env, [env.action_space.sample() for _ in range(steps + rng.integers(10))])
-    state = pickle.loads(pickle.dumps(env.state()))
+    state = pickle.loads(pickle.dumps(env.recorded_state()))
     actions = [env.action_space.sample() for _ in range(300)]
     expected = go_on(env, actions)
 
@@ -212,8 +213,8 @@ def test_replay_of_an_episode_after_a_replay():
     for action in np.random.default_rng(0).uniform(-1, 1, (20, 4)):
         env.step(action)
     again = recorded("BipedalWalker-v3")
-    assert again.replay(env.state())
-    assert difference(again.state(), env.state()) is None
+    assert again.replay(env.recorded_state())
+    assert difference(again.recorded_state(), env.recorded_state()) is None
 
 
 def test_wrappers_have_their_counts_again():
@@ -227,7 +228,7 @@ def test_wrappers_have_their_counts_again():
         if any(env.step(np.array([1.0]))[2:4]):
             env.reset()
     other.reset(seed=5)
-    assert other.replay(env.state())
+    assert other.replay(env.recorded_state())
     limits = [env.get_wrapper_attr("total_steps"), other.get_wrapper_attr("total_steps")]
     assert limits[0] == limits[1] == 36
     assert difference(other.step(np.array([0.5])), env.step(np.array([0.5]))) is None
@@ -263,7 +264,7 @@ def test_what_cannot_be_replayed_is_noticed(tmp_path, where):
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(3))
-    assert not env.replay(env.state())
+    assert not env.replay(env.recorded_state())
     assert env.monitor.results_writer is not None
 
 
@@ -272,7 +273,7 @@ def test_an_episode_that_ends_in_its_replay_is_noticed(tmp_path):
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(3))
-    state, before = env.state(), (tmp_path / "0.monitor.csv").read_text()
+    state, before = env.recorded_state(), (tmp_path / "0.monitor.csv").read_text()
     env.unwrapped.where = "end"
     assert not env.replay(state)
     assert (tmp_path / "0.monitor.csv").read_text() == before  # it never happened
@@ -397,10 +398,9 @@ def test_what_cannot_be_recorded():
         record_episodes(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
 
 
-def test_buffer_that_was_not_empty(tmp_path, small, pendulum):
-    model = small(REDQ, pendulum()).learn(40)
-    with pytest.raises(ValueError, match="expected one that was empty at step 0"):
-        model.learn(40, callback=ExactCheckpoints(tmp_path, 30))
+@pytest.mark.parametrize("buffer_size", [1000, 60, 45])
+def test_buffer_that_was_not_empty(tmp_path, small, pendulum, buffer_size):
+    compared(tmp_path, lambda: small(REDQ, pendulum(), buffer_size=buffer_size).learn(45))
 
 
 def fresh(tmp_path, make, steps, at, capsys):
@@ -418,13 +418,23 @@ def fresh(tmp_path, make, steps, at, capsys):
     return model
 
 
-def test_environments_in_other_processes_get_fresh_episodes(tmp_path, capsys):
-    def make():
-        env = make_vec_env("Pendulum-v1", n_envs=2, seed=0, vec_env_cls=SubprocVecEnv)
-        return PPO("MlpPolicy", env, n_steps=15, batch_size=30, policy_kwargs=dict(net_arch=[8]), seed=0)
+def in_processes(recorded):
+    def one(index):
+        env = gym.make("Pendulum-v1", max_episode_steps=20 + index)
+        return RecordedEpisode(Monitor(env)) if recorded else Monitor(env)
 
-    model = fresh(tmp_path, make, 150, 110, capsys)
-    model.env.close()
+    env = SubprocVecEnv([partial(one, index) for index in range(2)])
+    env.seed(0)
+    return PPO("MlpPolicy", env, n_steps=15, batch_size=30, policy_kwargs=dict(net_arch=[8]), seed=0)
+
+
+def test_environments_in_other_processes(tmp_path, monkeypatch):
+    monkeypatch.setattr("test_checkpoint.record_episodes", lambda env: None)
+    compared(tmp_path, partial(in_processes, recorded=True), steps=150, at=110, evaluate=False)
+
+
+def test_environments_that_are_not_recorded_get_fresh_episodes(tmp_path, capsys):
+    fresh(tmp_path, partial(in_processes, recorded=False), 150, 110, capsys).env.close()
 
 
 @pytest.mark.parametrize("n_steps, optimize", [(1, False), (3, False), (1, True)])

@@ -379,6 +379,13 @@ def test_checkpoints_that_were_deleted(folder, capsys):
     assert contents(run) == before
 
 
+def test_another_machine(killed, monkeypatch, capsys):
+    run = killed(230, options())
+    monkeypatch.setattr("torch.get_num_threads", lambda: 7)
+    resume(run)
+    assert "(resumed at 200; not bit for bit: threads 1 before, 7 now)" in capsys.readouterr().out
+
+
 def test_one_process_at_a_time(killed, capsys):
     run = killed(230, options())
     capsys.readouterr()

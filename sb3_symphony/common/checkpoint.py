@@ -23,7 +23,7 @@ import random
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -43,6 +43,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_symphony import __version__
 from sb3_symphony.common.checks import check_number
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -196,6 +197,70 @@ class ReplaySegments:
             for name, array in _storage(buffer):
                 array[places] = content[name]
 
+    def transitions(self) -> Iterator[dict[str, np.ndarray]]:
+        """
+        Read all transitions in the order of time, whatever buffer they are for.
+
+        :return: arrays ``(rows, n_envs, ...)`` by name, segment by segment
+        :raises DamagedCheckpoint: if a segment is damaged
+        """
+        for segment, following in zip(self.segments, [*self.segments[1:], None], strict=True):
+            stop = segment.stop if following is None else min(segment.stop, following.start)
+            content = _unseal(self.folder / segment.file, segment.checksum)
+            yield {name: array[: stop - segment.start] for name, array in content.items()}
+
+    @staticmethod
+    def of(buffer: ReplayBuffer) -> dict[str, np.ndarray]:
+        """
+        :param buffer: replay buffer
+        :return: its transitions in the order of time, as :meth:`transitions` gives them
+        """
+        order = (np.arange(buffer.size()) + (buffer.pos if buffer.full else 0)) % buffer.buffer_size
+        return {name: array[order] for name, array in _storage(buffer)}
+
+
+def add_transitions(buffer: ReplayBuffer, parts: Iterable[dict[str, np.ndarray]]) -> int:
+    """
+    Fill an empty replay buffer with transitions of another one, of any size; the latest ones if it is smaller.
+
+    :param buffer: the empty buffer
+    :param parts: transitions in the order of time, from :meth:`ReplaySegments.transitions`
+    :return: number of rows added
+    :raises ValueError: if they do not fit the buffer
+    :raises DamagedCheckpoint: if they cannot be read
+    """
+    if isinstance(buffer, HerReplayBuffer) or buffer.optimize_memory_usage:
+        raise ValueError("a buffer with HER or optimize_memory_usage cannot be filled with transitions of another one")
+    wanted = {name: array.shape[1:] for name, array in _storage(buffer)}
+    collected: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
+    for part in parts:
+        found = {name: array.shape[1:] for name, array in part.items()}
+        for name in wanted:
+            if found.get(name) != wanted[name]:
+                raise ValueError(f"{name} of shape {found.get(name)} (n_envs first), expected {wanted[name]}")
+            collected[name].append(part[name])
+    if not collected["rewards"]:
+        return 0
+    rows = {name: np.concatenate(arrays)[-buffer.buffer_size :] for name, arrays in collected.items()}
+
+    def observation(name: str, row: int) -> Any:
+        if name in rows:
+            return rows[name][row]
+        return {key.partition(".")[2]: array[row] for key, array in rows.items() if key.startswith(f"{name}.")}
+
+    count = len(rows["rewards"])
+    for row in range(count):
+        buffer.add(
+            observation("observations", row),
+            observation("next_observations", row),
+            rows["actions"][row],
+            rows["rewards"][row],
+            rows["dones"][row],
+            [{"TimeLimit.truncated": bool(cut)} for cut in rows["timeouts"][row]],
+        )
+    _end_trajectory(buffer, ReplaySegments(Path()))
+    return count
+
 
 _NOT_BUFFER_STATE = {*_STORAGE, "env", "device", "observation_space", "action_space"}
 
@@ -313,7 +378,7 @@ class RecordedEpisode(gym.Wrapper):
         self.observation = result[0]
         return result
 
-    def state(self) -> dict[str, Any]:
+    def recorded_state(self) -> dict[str, Any]:
         """:return: what :meth:`replay` and :meth:`start_anew` need"""
         return {
             "start": self.start,
@@ -329,7 +394,7 @@ class RecordedEpisode(gym.Wrapper):
         """
         Begin the recorded episode again and replay its actions.
 
-        :param state: from :meth:`state`
+        :param state: from :meth:`recorded_state`
         :return: whether that reproduced observation and rewards bit for bit
         """
         start, writer = state["start"], self.monitor.results_writer
@@ -352,7 +417,7 @@ class RecordedEpisode(gym.Wrapper):
         """
         Take up what outlives an episode (the generator, what wrappers and monitor count), before a reset.
 
-        :param state: from :meth:`state`
+        :param state: from :meth:`recorded_state`
         """
         self._set_wrappers(state["wrappers"])
         self._set_generators(state["generators"])
@@ -408,7 +473,8 @@ def _pickled(name: str, value: Any) -> bytes | None:
 
 def record_episodes(env: VecEnv) -> None:
     """
-    Put :class:`RecordedEpisode` around each copy of an environment, so that checkpoints can hold its state.
+    Put :class:`RecordedEpisode` around each copy of an environment, so that checkpoints can hold its state. Environments
+    in processes of their own have to be made with that wrapper.
 
     :param env: environment whose copies are in this process and have a ``Monitor``, as those of ``make_vec_env``
     :raises TypeError: if it is another kind
@@ -419,8 +485,13 @@ def record_episodes(env: VecEnv) -> None:
     copies.envs = [RecordedEpisode(copy) for copy in copies.envs]
 
 
-def _recorded(env: VecEnv) -> list[RecordedEpisode]:
-    return [copy for copy in getattr(env.unwrapped, "envs", []) if isinstance(copy, RecordedEpisode)]
+def _is_recorded(env: VecEnv) -> bool:
+    return all(env.env_is_wrapped(RecordedEpisode))
+
+
+def _each(env: VecEnv, method: str, states: Sequence[dict[str, Any]]) -> list[Any]:
+    """Call a method of each :class:`RecordedEpisode`, which may be in another process, with its own state."""
+    return [env.env_method(method, state, indices=[index])[0] for index, state in enumerate(states)]
 
 
 # What wrappers of vectorised environments know: VecNormalize (its own pickle drops the returns) and VecFrameStack
@@ -498,8 +569,9 @@ def platform_of(model: BaseAlgorithm) -> dict[str, str]:
     :param model: an algorithm
     :return: what has to be the same for results to be equal bit for bit
     """
-    packages = ("torch", "numpy", "stable_baselines3", "gymnasium")
+    packages = ("torch", "numpy", "numba", "stable_baselines3", "sb3_contrib", "gymnasium")
     return {
+        "sb3_symphony": __version__,
         **{package: version(package) for package in packages},
         "Python": platform.python_version(),
         "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
@@ -653,6 +725,8 @@ class ExactCheckpoints(BaseCallback):
         self.finished = False  # whether learn() came to its end, with everything learned that was experienced
         self._rollout_ended = False
         self._latest = 0 if checkpoint is None else checkpoint.steps
+        # Of another agent, which the run began with
+        self._rows_before = 0 if checkpoint is None else checkpoint.state.get("rows before", 0)
         self.segments = ReplaySegments(folder, [] if checkpoint is None else checkpoint.state["segments"])
         self._segments_of: dict[int, set[str]] = {}  # steps of a checkpoint -> files that it needs
         self._restoring = checkpoint
@@ -661,6 +735,10 @@ class ExactCheckpoints(BaseCallback):
     def restored(self) -> bool:
         """Whether the model has the state it is to have: not before the first rollout of a resumed run."""
         return self._restoring is None
+
+    def _init_callback(self) -> None:
+        if self._restoring is None and self._buffer is not None:
+            self._rows_before = self._buffer.size()
 
     def _on_rollout_start(self) -> None:
         if self._restoring is not None:
@@ -701,11 +779,12 @@ class ExactCheckpoints(BaseCallback):
             state["log folder"] = None if log_folder is None else os.path.abspath(log_folder)
             state["callbacks"] = {type(callback).__name__: _attributes(callback) for callback in self.callbacks}
             state["files"] = {path.name: path.read_bytes() for path in self.files()}
-            state["episodes"] = [copy.state() for copy in _recorded(model.env)]
+            state["episodes"] = model.env.env_method("recorded_state") if _is_recorded(model.env) else []
             state["segments"] = []
             if self._buffer is not None:
                 state["buffer"] = _buffer_state(self._buffer)
-                state["segments"] = self.segments.save(self._buffer, steps // model.n_envs)
+                state["segments"] = self.segments.save(self._buffer, self._rows_before + steps // model.n_envs)
+                state["rows before"] = self._rows_before
             for path in self.beside():
                 with open(path, "r+b") as file:
                     os.fsync(file.fileno())
@@ -737,10 +816,8 @@ class ExactCheckpoints(BaseCallback):
     def _restore(self, checkpoint: Checkpoint) -> None:
         model, state = self.model, checkpoint.state
         assert model.env is not None
-        recorded = _recorded(model.env)
-        exact = len(recorded) == len(state["episodes"]) == model.n_envs
-        # All of them, even if one fails: each takes up its counts
-        exact &= all([copy.replay(episode) for copy, episode in zip(recorded, state["episodes"], strict=False)])
+        episodes = state["episodes"] if _is_recorded(model.env) else []
+        exact = len(episodes) == model.n_envs and all(_each(model.env, "replay", episodes))
         if self._buffer is not None:
             _restore_buffer(self._buffer, state["buffer"], self.segments)
         for callback in self.callbacks:
@@ -748,10 +825,9 @@ class ExactCheckpoints(BaseCallback):
         restore_training_state(model, state)
 
         if not exact:
-            for copy, episode in zip(recorded, state["episodes"], strict=False):
-                copy.start_anew(episode)
+            _each(model.env, "start_anew", episodes)
             self._start_anew()
-            why = "replaying the actions did not reproduce the episode" if recorded else "the episodes were not recorded"
+            why = "replaying the actions did not reproduce the episode" if episodes else "the episodes were not recorded"
             self.report(f"resumed at {checkpoint.steps} steps with fresh episodes, hence not bit for bit: {why}")
         if not state["rollout follows"] and getattr(model, "use_sde", False):
             owner: Any = getattr(model, "actor", model.policy)
