@@ -1,5 +1,7 @@
 """What a run must keep to for its numbers to stand beside those of others: ``train --protocol standard``."""
 
+from importlib import import_module
+
 import gymnasium as gym
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
@@ -18,12 +20,15 @@ EVAL_EPISODES = 10
 
 def reward_threshold(env_id: str) -> float | None:
     """
-    :param env_id: registered id of an environment
+    :param env_id: registered id of an environment, with the module that registers it if need be: ``module:Env-v0``
     :return: the return from which on it counts as solved, as far as it is registered with one
     :raises ConfigError: if there is no such environment
     """
+    module, _, name = env_id.rpartition(":")
     try:
-        threshold = gym.spec(env_id).reward_threshold
+        if module:
+            import_module(module)
+        threshold = gym.spec(name).reward_threshold
     except (gym.error.Error, ImportError) as error:
         raise ConfigError(f"environment '{env_id}' — {error}") from None
     return None if threshold is None else float(threshold)
@@ -54,12 +59,14 @@ def keep_protocol(options: TrainOptions, config: RunConfig) -> TrainOptions:
         if name in options.model_fields_set and given != value:
             flag = "--" + name.replace("_", "-")
             raise ConfigError(f"{flag}: {given} — expected {value} or nothing, as --protocol {options.protocol} has it")
-    if config.settings.env_kwargs:
-        names = ", ".join(config.settings.env_kwargs)
+    if config.settings.env_kwargs or options.eval_env_kwargs:
+        names = ", ".join([*config.settings.env_kwargs, *options.eval_env_kwargs])
         raise ConfigError(f"env_kwargs: '{names}' — --protocol {options.protocol} is for the environment as registered")
     for name, _ in config.settings.env_wrapper:
         if not issubclass(find_wrapper(name), LearningReward):
             raise ConfigError(f"env_wrapper: '{name}' — changes the task, which --protocol {options.protocol} leaves as it is")
+    for name, _ in config.settings.vec_env_wrapper:
+        raise ConfigError(f"vec_env_wrapper: '{name}' — --protocol {options.protocol} is for the environment as registered")
     threshold = reward_threshold(options.env) if options.threshold is None else options.threshold
     return options.model_copy(update={**settled, "threshold": threshold})
 
