@@ -1,10 +1,8 @@
 """What happens beside learning: evaluation, stopping on a signal, progress bar."""
 
 import os
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_symphony.analysis.statistics import first_stable_evaluation
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.decode import argument_types, class_by_name, typed_arguments
+from sb3_symphony.experiment.signals import handled_by
 
 
 class StopOnSignal(BaseCallback):
@@ -51,18 +50,9 @@ class StopOnSignal(BaseCallback):
         # Not print(): a signal may arrive inside one
         os.write(2, b"\nstopping as soon as all can be saved (once more: at once)\n")
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
+    def listening(self) -> AbstractContextManager[None]:
         """Handle signals inside the block, where Python allows it (the main thread)."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        return handled_by(self._handle)
 
     def here(self) -> bool:
         """:return: at the start of a rollout, whether training is going to stop there"""

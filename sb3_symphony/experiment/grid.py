@@ -11,7 +11,6 @@ Results lie in one folder, which holds all that is needed to go on or to make th
 """
 
 import shutil
-import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -27,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sb3_symphony.experiment.cell import Control, Job, Outcome, read_result, supervise
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, parse_yaml, read_yaml
 from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.signals import handled_by
 from sb3_symphony.experiment.study import Cell, Environment, cells_of, configuration, read_study
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
@@ -338,7 +338,7 @@ class _Session:
         from sb3_symphony.experiment.grid_view import View
 
         self.control.say(0)
-        with self._listening(), View(self.progress) as view:
+        with handled_by(self._on_signal), View(self.progress) as view:
             thread = threading.Thread(target=self._work, daemon=True)
             thread.start()
             said, beat = 0, time.monotonic()
@@ -353,22 +353,9 @@ class _Session:
             raise self.error
         return self.stop > 0
 
-    @contextmanager
-    def _listening(self) -> Iterator[None]:
+    def _on_signal(self, signum: int, frame: Any) -> None:
         """Ctrl-C stops all cells, wherever they run; each saves what it has. A second one does not wait for that."""
-
-        def handle(signum: int, frame: Any) -> None:
-            self.stop += 1
-
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        self.stop += 1
 
     def _work(self) -> None:
         try:
