@@ -29,11 +29,8 @@ from sb3_symphony.experiment.select import (
 from sb3_symphony.experiment.space import TuneOptions
 
 _TRAIN_EXAMPLES = """examples:
-  sb3-symphony train                                  Symphony learns to walk
-  sb3-symphony train --algo sac --env Pendulum-v1 --seed 0
   sb3-symphony train --algo redq -n 50000 -params gradient_steps:5 policy_kwargs.net_arch:[64,64]
-  sb3-symphony train -conf logs/symphony/BipedalWalker-v3_1/BipedalWalker-v3/config.yml
-  sb3-symphony train --resume logs/symphony/BipedalWalker-v3_1
+  sb3-symphony train --env BipedalWalkerHardcore-v3 -i logs/symphony/BipedalWalker-v3_1
 """
 
 _EVALUATE_EXAMPLES = """examples:
@@ -107,6 +104,15 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=34, width=110)
 
+    def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
+        return f"{action.metavar} ..." if action.nargs == "+" else super()._format_args(action, default_metavar)
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        """``-f, --folder DIR``: the value once, as newer versions of Python have it."""
+        if not action.option_strings or action.nargs == 0:
+            return super()._format_action_invocation(action)
+        return f"{', '.join(action.option_strings)} {self._format_args(action, action.dest.upper())}"
+
 
 def _whole_number(text: str) -> int:
     """``1e6`` is what one types for a million."""
@@ -133,10 +139,15 @@ def _add_train(commands: Any) -> None:
     # Only what is given reaches the options, so that --resume can tell it from the defaults
     add = partial(parser.add_argument, default=argparse.SUPPRESS)
     default = TrainOptions()
-    add("--algo", metavar="ALGO", help=f"{', '.join(ALGORITHMS)} (default: {default.algo})")
+    add("--algo", metavar="ALGO", help=", ".join([f"{default.algo} (default)", *list(ALGORITHMS)[1:]]))
     add("--env", metavar="ID", help=f"registered environment (default: {default.env})")
+    add("--gym-packages", nargs="+", metavar="M", help="modules to import, which register environments")
     add("-n", "--n-timesteps", type=_whole_number, metavar="N", help="environment steps (default: the configuration's)")
     add("--seed", type=_whole_number, metavar="N", help=f"seed; -1 draws one (default: {default.seed})")
+    add("--n-seeds", type=_whole_number, metavar="K", help="K runs one after the other, on seeds N, N + 1, … (default: 1)")
+    agent = "start from a trained agent's networks: model's zip file or run folder"
+    add("-i", "--trained-agent", metavar="PATH", help=agent)
+    add("--with-replay-buffer", action="store_true", help="with -i: and from its replay buffer")
     add("-f", "--log-folder", metavar="DIR", help=f"where runs are kept (default: {default.log_folder})")
     every, episodes = f"(default: {default.eval_freq})", f"(default: {default.eval_episodes})"
     add("--eval-freq", type=_whole_number, metavar="N", help=f"steps between evaluations, 0: none {every}")
@@ -146,6 +157,8 @@ def _add_train(commands: Any) -> None:
     add("-params", "--hyperparams", nargs="+", metavar="K:V", help="override hyper-parameters; values are YAML")
     add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset to use, e.g. symphony-original (default: shipped)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
+    add("--eval-env-kwargs", nargs="+", metavar="K:V", help="those of the evaluations, over these")
+    add("--vec-env", metavar="KIND", choices=("dummy", "subproc"), help="subproc: a process for each of n_envs")
     add("-tb", "--tensorboard-log", metavar="DIR", help="write TensorBoard logs there")
     add("--save-freq", type=_whole_number, metavar="N", help="steps between checkpoints (default: none)")
     add("--keep", type=_whole_number, metavar="K", help=f"checkpoints to keep (default: {default.keep})")
@@ -155,22 +168,46 @@ def _add_train(commands: Any) -> None:
     add("--log-interval", type=_whole_number, metavar="N", help="episodes between log lines, -1: default, -2: none")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
     add("--verbose", type=int, choices=(0, 1, 2), help="log to the terminal (default: 1, with a progress bar 0)")
+    add("--quiet", action="store_true", help="print nothing but errors")
+    add("--json", dest="json_file", metavar="OUT", help="write results as JSON; -: print them so, and nothing else")
+    add("--dry-run", action="store_true", help="only print the whole configuration, and where each value comes from")
     parser.set_defaults(run=_train, parser=parser)
 
 
 def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
-    for name, flag in (("hyperparams", "-params"), ("env_kwargs", "--env-kwargs")):
+    pairs = (("hyperparams", "-params"), ("env_kwargs", "--env-kwargs"), ("eval_env_kwargs", "--eval-env-kwargs"))
+    for name, flag in pairs:
         if name in arguments:
             arguments[name] = parse_pairs(arguments[name], flag)
+    only_show = arguments.pop("dry_run", False)
+    if arguments.get("json_file") == "-":
+        arguments["quiet"] = True
+    if arguments.get("quiet"):
+        arguments |= {"progress": False, "verbose": 0}
     arguments.setdefault("progress", sys.stdout.isatty())
     options = validated(TrainOptions, arguments)
     check_algorithm(options.algo)  # before the slow imports
 
-    from sb3_symphony.experiment.train import train
+    from sb3_symphony.experiment.output import report
 
-    result = train(options, command=shlex.join(["sb3-symphony", *argv]))
-    print(result.summary())
-    return 130 if result.interrupted else 0
+    if only_show:
+        from sb3_symphony.experiment.dry_run import as_yaml, dry_run
+
+        with report(options.json_file) as tell:
+            values = dry_run(options)
+            tell({key: {"value": value, "source": source} for key, (value, source) in values.items()})
+        if options.json_file != "-":
+            print(as_yaml(options, values))
+        return 0
+
+    from sb3_symphony.experiment.train import train_seeds
+
+    with report(options.json_file) as tell:
+        results = train_seeds(options, command=shlex.join(["sb3-symphony", *argv]))
+        tell({"runs": [result.plain() for result in results]})
+    if not options.quiet:
+        print(results[-1].summary())
+    return 130 if results[-1].interrupted else 0
 
 
 def _add_selection(parser: argparse.ArgumentParser, several: bool = False) -> None:

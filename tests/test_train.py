@@ -56,7 +56,7 @@ def test_run_folder(folder, capsys):
         "training.png",
     }
     details = run / "Pendulum-v1"
-    assert {path.name for path in details.iterdir()} == {"args.yml", "config.yml", "command.txt"}
+    assert {path.name for path in details.iterdir()} == {"args.yml", "config.yml", "command.txt", "tensorboard.txt"}
     assert (details / "command.txt").read_text().startswith("sb3-symphony train --algo td3 --env Pendulum-v1 -n 450")
     assert yaml.safe_load((details / "args.yml").read_text())["seed"] == 1
     stored = yaml.safe_load((details / "config.yml").read_text())

@@ -16,12 +16,19 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.environment import Wrappers, import_packages, make_env, split_wrappers, stacked
+from sb3_symphony.experiment.environment import (
+    RunMonitor,
+    Wrappers,
+    import_packages,
+    make_env,
+    split_wrappers,
+    stacked,
+    vec_wrapped,
+)
 from sb3_symphony.experiment.registry import LOADABLE, load_algorithm
 from sb3_symphony.experiment.select import Selection, SelectOptions, pretrained_folder, select_model
 
@@ -114,7 +121,7 @@ def open_agent(
     try:
         model = load_model(selection, options.device)
         env = BaseAlgorithm._wrap_env(env, verbose=0)  # images with their channels first, as in training
-        _check_match(model, env, selection)
+        check_match(model, env, selection)
     except BaseException:
         env.close()
         raise
@@ -145,16 +152,22 @@ def _make_env(selection: Selection, n_envs: int, render_mode: str | None, wrappe
         env_kwargs["render_mode"] = render_mode
 
     def one() -> gym.Env:
-        return Monitor(make_env(selection.env_id, env_kwargs, [*task, *wrappers]))
+        return RunMonitor(make_env(selection.env_id, env_kwargs, [*task, *wrappers]))
 
-    env: VecEnv = DummyVecEnv([one] * n_envs)
+    env = vec_wrapped(DummyVecEnv([one] * n_envs), selection.settings)
     if selection.normalization is not None:
-        env = _load_normalization(selection.normalization, env)
+        env = load_normalization(selection.normalization, env)
         env.training, env.norm_reward = False, norm_reward and env.norm_reward
     return stacked(env, selection.settings)
 
 
-def _load_normalization(path: Path, env: VecEnv) -> VecNormalize:
+def load_normalization(path: Path, env: VecEnv) -> VecNormalize:
+    """
+    :param path: statistics saved by ``VecNormalize``
+    :param env: environment to normalise; closed if that fails
+    :return: the environment, normalised by them
+    :raises ConfigError: if they are damaged, or do not fit
+    """
     try:
         return VecNormalize.load(str(path), env)
     except Exception as error:  # a pickle can fail in any way
@@ -259,8 +272,15 @@ def _fits(model: spaces.Space, env: spaces.Space, exact: bool) -> bool:
     return model == env
 
 
-def _check_match(model: BaseAlgorithm, env: VecEnv, selection: Selection) -> None:
-    """Limits of observations are not compared: they differ between versions of an environment, and nothing uses them."""
+def check_match(model: BaseAlgorithm, env: VecEnv, selection: Selection) -> None:
+    """
+    Limits of observations are not compared: they differ between versions of an environment, and nothing uses them.
+
+    :param model: a trained model
+    :param env: environment that it is to act in
+    :param selection: where both come from
+    :raises ConfigError: if their spaces differ
+    """
     for what, own, given, exact in (
         ("observation", model.observation_space, env.observation_space, False),
         ("action", model.action_space, env.action_space, True),

@@ -1,6 +1,9 @@
 """What happens beside learning: evaluation, stopping on a signal, progress bar."""
 
+import io
 import os
+import pickle
+import warnings
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -21,6 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.statistics import first_stable_evaluation
+from sb3_symphony.common.checkpoint import write_atomically
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.decode import argument_types, class_by_name, typed_arguments
 from sb3_symphony.experiment.signals import handled_by
@@ -71,21 +75,39 @@ class _EvaluationAborted(Exception):
     pass
 
 
-class SaveNormalization(BaseCallback):
+def save_model(model: BaseAlgorithm, path: Path, normalization_path: Path) -> None:
     """
-    Saves the statistics of ``VecNormalize`` beside a new best model.
+    Save a model and, before it, the statistics of ``VecNormalize`` that belong to it. If that fails, files that were there
+    before stay as they were.
 
-    :param path: file
+    :param model: the model
+    :param path: its file
+    :param normalization_path: file of the statistics, if there are any
+    :raises OSError: if one of them cannot be written
+    """
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        write_atomically(normalization_path, pickle.dumps(normalization))
+    content = io.BytesIO()
+    model.save(content)
+    write_atomically(path, content.getvalue())
+
+
+class SaveBestModel(BaseCallback):
+    """
+    Saves a new best model.
+
+    :param path: its file
+    :param normalization_path: file of its statistics
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, normalization_path: Path) -> None:
         super().__init__()
         self.path = path
+        self.normalization_path = normalization_path
 
     def _on_step(self) -> bool:
-        normalization = self.model.get_vec_normalize_env()
-        if normalization is not None:
-            normalization.save(str(self.path))
+        save_model(self.model, self.path, self.normalization_path)
         return True
 
 
@@ -97,6 +119,8 @@ class SeededEvaluation(EvalCallback):
     :param stop: tells whether to stop
     :param threshold: mean return that two consecutive evaluations must reach for the environment to be solved
     :param solved_stride: from then on only every n-th evaluation takes place
+    :param stop_reward: mean return of an evaluation that ends the training
+    :param log_path: folder for ``evaluations.npz``, which is replaced as a whole at each evaluation
     :param kwargs: arguments of ``EvalCallback``
     """
 
@@ -106,12 +130,21 @@ class SeededEvaluation(EvalCallback):
         stop: StopOnSignal,
         threshold: float | None = None,
         solved_stride: int = 1,
+        stop_reward: float | None = None,
+        log_path: Path | None = None,
         **kwargs: Any,
     ) -> None:
         super().__init__(eval_env, **kwargs)
+        self.log_path = None if log_path is None else str(log_path / ".evaluations.tmp.npz")
+        self.stop_reward = stop_reward
         self.stop = stop
         self.threshold = threshold
         self.solved_stride = solved_stride
+
+    def _init_callback(self) -> None:
+        with warnings.catch_warnings():  # training may be spread over processes
+            warnings.filterwarnings("ignore", message="Training and eval env are not of the same type")
+            super()._init_callback()
 
     def _solved(self) -> bool:
         steps, results = self.evaluations_timesteps, self.evaluations_results
@@ -126,11 +159,20 @@ class SeededEvaluation(EvalCallback):
         if self.eval_freq > 0 and self.n_calls % self.eval_freq == 0:
             if self.n_calls // self.eval_freq % self.solved_stride and self._solved():
                 return True
-            self.eval_env.env_method("restart_seeds")
+        else:
+            return True
+        self.eval_env.env_method("restart_seeds")
         try:
-            return super()._on_step()
+            go_on = super()._on_step()
         except _EvaluationAborted:
             return False
+        except BaseException:
+            if self.log_path is not None:
+                Path(self.log_path).unlink(missing_ok=True)
+            raise
+        if self.log_path is not None:
+            os.replace(self.log_path, Path(self.log_path).with_name("evaluations.npz"))
+        return go_on and not (self.stop_reward is not None and self.last_mean_reward >= self.stop_reward)
 
 
 def configured_callbacks(

@@ -9,7 +9,7 @@ Stable-Baselines3.
 
 import ast
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
@@ -194,11 +194,19 @@ class TrainOptions(BaseModel):
     save_freq: int = Field(default=-1, ge=-1)
     keep: int = Field(default=2, ge=1)
     resume: str | None = None
+    trained_agent: str | None = None
+    with_replay_buffer: bool = False
+    gym_packages: list[str] = []
+    vec_env: Literal["dummy", "subproc"] = "dummy"
+    eval_env_kwargs: dict[str, Any] = {}
+    n_seeds: int = Field(default=1, ge=1)
     device: str = "auto"
     num_threads: int = -1
     log_interval: int = Field(default=-1, ge=-2)
     verbose: int | None = Field(default=None, ge=0, le=2)
     progress: bool | None = None
+    quiet: bool = False
+    json_file: str | None = None  # "-": none, whoever asks prints it
 
     @field_validator("n_timesteps")
     @classmethod
@@ -246,11 +254,13 @@ class RunSettings(BaseModel):
     :param n_envs: number of parallel environments
     :param normalize: ``VecNormalize`` with its defaults, or its arguments
     :param env_wrapper: dotted names of wrappers and their arguments, from the inside out
+    :param vec_env_wrapper: the same for wrappers of the vectorised environment, inside ``VecNormalize``
     :param env_kwargs: arguments of the environment
     :param frame_stack: number of latest observations that the agent sees at once, by ``VecFrameStack``
     :param callback: names of callbacks and their arguments
     :param noise_type: exploration noise of Stable-Baselines3, by Zoo's names
     :param noise_std: its standard deviation, in scaled action units
+    :param stop_reward: mean return of an evaluation that ends the training
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -260,11 +270,13 @@ class RunSettings(BaseModel):
     n_envs: _Count = 1
     normalize: bool | dict[str, Any] = False
     env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
+    vec_env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
     callback: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
     env_kwargs: dict[str, Any] = {}
     frame_stack: _Count | None = None
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
     noise_std: Annotated[FiniteFloat, Field(ge=0)] | None = None
+    stop_reward: FiniteFloat | None = None
 
 
 @dataclass
@@ -320,8 +332,14 @@ def check_algorithm(name: str, known: Iterable[str] = ALGORITHMS) -> None:
         raise ConfigError(f"unknown algorithm '{name}'{near}")
 
 
-def _entry(options: TrainOptions) -> dict[str, Any]:
-    """The environment's entry, else ``default``, of the given file or preset or the shipped file; a flat file is its own."""
+def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
+    """
+    Look up the environment's entry, else ``default``, in the given file or preset or the shipped file; a flat file is its own.
+
+    :param options: options of the command line
+    :return: where it stands, and the entry
+    :raises ConfigError: if there is none, or the file cannot be read
+    """
     path = Path(options.conf_file or shipped_folder() / f"{options.algo}.yml")
     preset = shipped_folder() / "presets" / f"{path}.yml"
     if preset.is_file() and not path.exists():
@@ -331,10 +349,10 @@ def _entry(options: TrainOptions) -> dict[str, Any]:
         if name in content:
             if not isinstance(content[name], dict):
                 raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")
-            return content[name]
+            return f"{path.name}, {name}" if options.conf_file is None else f"-conf {path}, {name}", content[name]
     if content and all(isinstance(value, dict) and "n_timesteps" in value for value in content.values()):
         raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
-    return content
+    return f"-conf {path}", content
 
 
 def _override(plain: dict[str, Any], key: str, value: Any) -> None:
@@ -372,16 +390,18 @@ def run_settings(content: dict[str, Any]) -> RunSettings:
     return settings
 
 
-def load_config(options: TrainOptions) -> RunConfig:
+def load_config(options: TrainOptions, inherited: Mapping[str, Any] | None = None) -> RunConfig:
     """
     Merge the shipped entry (or the given file instead of it) with the command line, later ones winning.
 
     :param options: options of the command line
+    :param inherited: values that go before those of the file, such as the networks of an agent to start from
     :return: the configuration, of which the algorithm's keys are yet to be checked
     :raises ConfigError: if a file or a key of the run is wrong
     """
     check_algorithm(options.algo)
-    return merge(_entry(options), options)
+    _, entry = find_entry(options)
+    return merge({**entry, **(inherited or {})}, options)
 
 
 def merge(entry: dict[str, Any], options: TrainOptions) -> RunConfig:

@@ -54,7 +54,7 @@ _CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
 }
 
 #: set by the command line
-_RESERVED = {"self", "env", "policy", "verbose", "seed", "device", "tensorboard_log", "_init_setup_model"}
+RESERVED = {"self", "env", "policy", "verbose", "seed", "device", "tensorboard_log", "_init_setup_model"}
 #: given by the algorithm to its policy
 _POLICY_RESERVED = {"self", "observation_space", "action_space", "lr_schedule", "use_sde"}
 
@@ -309,9 +309,9 @@ def algorithm_arguments(
     """
     types = argument_types(algorithm)
     for key in config.arguments:
-        if key in _RESERVED:
+        if key in RESERVED:
             raise ConfigError(f"'{key}' is not a hyper-parameter — it is set on the command line")
-    known = types.keys() - _RESERVED
+    known = types.keys() - RESERVED
     check_keys(config.arguments, known | RunSettings.model_fields.keys(), "hyper-parameter", name)
     settings = config.settings
     if settings.policy not in algorithm.policy_aliases:

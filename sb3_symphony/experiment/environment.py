@@ -1,5 +1,6 @@
 """Environments of a run: what is learned from, and what is evaluated."""
 
+import signal
 import time
 import warnings
 from collections.abc import Callable
@@ -12,9 +13,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.env_util import make_vec_env, unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecEnvWrapper,
+    VecFrameStack,
+    VecNormalize,
+    unwrap_vec_normalize,
+)
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
@@ -25,7 +33,9 @@ from sb3_symphony.experiment.decode import typed_arguments
 EVALUATION_SEED = 10_000
 
 _WRAPPER_PACKAGES = ("sb3_symphony.", "gymnasium.wrappers.", "stable_baselines3.", "sb3_contrib.")
-_WRITE_FILES = {"Monitor", "RecordVideo"}  # a configuration must not choose what is written where
+#: a configuration must not choose what is written where
+_WRITE_FILES = {"Monitor", "RecordVideo", "VecMonitor", "VecVideoRecorder"}
+_OWN_KEYS = {"VecNormalize": "normalize", "VecFrameStack": "frame_stack"}
 _TRAINING_ONLY = (LearningReward, EpisodeStepLimit)
 _ON_POLICY = ("ppo", "trpo")
 _ON_POLICY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
@@ -61,27 +71,39 @@ class EpisodeSeeds(gym.Wrapper):
         return self.env.reset(seed=seed, options=options)
 
 
-def find_wrapper(name: str) -> type[gym.Wrapper]:
+def find_wrapper(name: str, key: str = "env_wrapper") -> type:
     """
     :param name: dotted name of a wrapper, in one of the packages that a configuration may name
+    :param key: ``env_wrapper`` for one of ``gym.Wrapper``, ``vec_env_wrapper`` for one of ``VecEnvWrapper``
     :return: its class
     :raises ConfigError: if there is none
     """
     if not name.startswith(_WRAPPER_PACKAGES):
-        raise ConfigError(f"env_wrapper: '{name}' — expected a dotted name that starts with {', '.join(_WRAPPER_PACKAGES)}")
+        raise ConfigError(f"{key}: '{name}' — expected a dotted name that starts with {', '.join(_WRAPPER_PACKAGES)}")
     module_name, _, class_name = name.rpartition(".")
     try:
         module = import_module(module_name)
     except ImportError:
-        raise ConfigError(f"env_wrapper: '{name}' — there is no module '{module_name}'") from None
+        raise ConfigError(f"{key}: '{name}' — there is no module '{module_name}'") from None
+    if class_name in _OWN_KEYS and key == "vec_env_wrapper":
+        raise ConfigError(f"{key}: '{name}' — expected as the key {_OWN_KEYS[class_name]}")
+    kind = gym.Wrapper if key == "env_wrapper" else VecEnvWrapper
     wrappers = [
-        key
-        for key, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, gym.Wrapper) and key not in _WRITE_FILES
+        each
+        for each, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, kind) and value is not kind and each not in _WRITE_FILES
     ]
     if class_name not in wrappers:
-        raise ConfigError(f"env_wrapper: '{name}' — no such wrapper in {module_name}{suggestion(class_name, wrappers)}")
+        raise ConfigError(f"{key}: '{name}' — no such wrapper in {module_name}{suggestion(class_name, wrappers)}")
     return getattr(module, class_name)
+
+
+def for_training_only(name: str) -> bool:
+    """
+    :param name: dotted name of any wrapper
+    :return: whether it changes only what is learned from, and is left out where agents are evaluated or shown
+    """
+    return name.startswith("sb3_symphony.") and issubclass(find_wrapper(name), _TRAINING_ONLY)
 
 
 def split_wrappers(named: list[tuple[str, dict[str, Any]]]) -> tuple[Wrappers, Wrappers]:
@@ -97,7 +119,7 @@ def split_wrappers(named: list[tuple[str, dict[str, Any]]]) -> tuple[Wrappers, W
     for name, arguments in named:
         class_ = find_wrapper(name)
         wrapper = partial(class_, **typed_arguments(arguments, class_, ["env"]))
-        (training if issubclass(class_, _TRAINING_ONLY) else task).append(wrapper)
+        (training if for_training_only(name) else task).append(wrapper)
     return task, training
 
 
@@ -107,6 +129,24 @@ def _wrapped(env: gym.Env, wrappers: Wrappers) -> gym.Env:
             env = wrapper(env)
         except (ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"env_wrapper: {wrapper.func.__name__}: {error}") from None  # type: ignore[attr-defined]
+    return env
+
+
+def vec_wrapped(env: VecEnv, settings: RunSettings) -> VecEnv:
+    """
+    :param env: vectorised environment
+    :param settings: settings of the run
+    :return: the environment in the wrappers that ``vec_env_wrapper`` names
+    :raises ConfigError: if one does not fit
+    """
+    for name, arguments in settings.vec_env_wrapper:
+        class_ = find_wrapper(name, "vec_env_wrapper")
+        try:
+            env = class_(env, **typed_arguments(arguments, class_, ["venv", "env"]))
+        except (ValueError, TypeError, AssertionError, KeyError, AttributeError) as error:
+            if isinstance(error, ConfigError):
+                raise
+            raise ConfigError(f"vec_env_wrapper: {class_.__name__}: {error}") from None
     return env
 
 
@@ -144,7 +184,8 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
             message = 'MuJoCo is not installed: pip install "sb3-symphony[mujoco]"'
         raise ConfigError(f"environment '{env_id}' cannot be made — {message}") from None
     except gym.error.UnregisteredEnv:
-        near = suggestion(env_id, gym.registry) or " — expected a registered id such as BipedalWalker-v3"
+        near = suggestion(env_id, gym.registry)
+        near = near or " — expected a registered id such as BipedalWalker-v3; --gym-packages imports what registers one"
         raise ConfigError(f"unknown environment '{env_id}'{near}") from None
     except gym.error.Error as error:
         raise ConfigError(f"environment '{env_id}' cannot be made — {error}") from None
@@ -174,6 +215,18 @@ def check_spaces(env: VecEnv, env_id: str, algo: str, policy: str) -> None:
         raise ConfigError(f"frame_stack: cannot be combined with normalize for {algo} — only for {', '.join(_ON_POLICY)}")
     if policy == "MultiInputPolicy" and not isinstance(env.observation_space, spaces.Dict):
         raise ConfigError(f"policy: 'MultiInputPolicy' — needs Dict observations, {env_id} has {env.observation_space}")
+
+
+def check_same_spaces(training: VecEnv, evaluation: VecEnv) -> None:
+    """
+    :param training: environment that is learned from
+    :param evaluation: environment for evaluations
+    :raises ConfigError: if their spaces differ in shape
+    """
+    for what in ("observation_space", "action_space"):
+        ours, theirs = getattr(training, what), getattr(evaluation, what)
+        if type(ours) is not type(theirs) or ours.shape != theirs.shape:
+            raise ConfigError(f"--eval-env-kwargs: {what} {theirs} — that of the training is {ours}")
 
 
 def _normalized(env: VecEnv, settings: RunSettings, gamma: float | None, training: bool) -> VecEnv:
@@ -206,36 +259,78 @@ def stacked(env: VecEnv, settings: RunSettings) -> VecEnv:
         raise ConfigError(f"frame_stack: observations of {env.observation_space} cannot be stacked — {error}") from None
 
 
-def make_training_env(env_id: str, settings: RunSettings, gamma: float | None, seed: int) -> VecEnv:
+class RunMonitor(Monitor):
+    """A ``Monitor`` whose file may come later, in whichever process it is."""
+
+    def write_to(self, path: str, append: bool) -> None:
+        """
+        :param path: file to write, without ``.monitor.csv``
+        :param append: go on with it if it is there
+        """
+        self.t_start = time.time()
+        header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(self.spec.id if self.spec else None)}
+        self.results_writer = ResultsWriter(path, header=header, override_existing=not append)
+
+
+def _in_own_process(make: Callable[[], gym.Env], packages: list[str]) -> gym.Env:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the run decides
+    import_packages(packages)  # what is registered is registered in one process
+    return make()
+
+
+def make_training_env(
+    env_id: str,
+    settings: RunSettings,
+    gamma: float | None,
+    seed: int,
+    subprocesses: bool = False,
+    packages: list[str] | None = None,
+) -> VecEnv:
     """
     :param env_id: registered id
     :param settings: settings of the run
     :param gamma: the algorithm's discount factor, for the normalisation of rewards
     :param seed: environment ``i`` gets ``seed + i``
+    :param subprocesses: whether each copy gets a process of its own
+    :param packages: modules that register environments, which such a process has to import
     :return: vectorised environment whose monitors do not write yet (see :func:`attach_monitor_files`)
     """
     task, training = split_wrappers(settings.env_wrapper)
-    env = make_vec_env(
-        partial(make_env, env_id, settings.env_kwargs, task),
-        n_envs=settings.n_envs,
-        seed=seed,
-        wrapper_class=partial(_wrapped, wrappers=training),
-    )
-    return stacked(_normalized(env, settings, gamma, training=True), settings)
+
+    def one(index: int) -> gym.Env:
+        env = _wrapped(RunMonitor(make_env(env_id, settings.env_kwargs, task)), training)
+        env.action_space.seed(seed + index)
+        return env
+
+    makers: list[Callable[[], gym.Env]] = [partial(one, index) for index in range(settings.n_envs)]
+    env: VecEnv
+    if subprocesses:
+        one(0).close()  # a mistake is told here
+        env = SubprocVecEnv([partial(_in_own_process, make, packages or []) for make in makers])
+    else:
+        env = DummyVecEnv(makers)
+    env.seed(seed)
+    try:
+        return stacked(_normalized(vec_wrapped(env, settings), settings, gamma, training=True), settings)
+    except BaseException:
+        env.close()
+        raise
 
 
-def make_evaluation_env(env_id: str, settings: RunSettings) -> VecEnv:
+def make_evaluation_env(env_id: str, settings: RunSettings, env_kwargs: dict[str, Any] | None = None) -> VecEnv:
     """
     :param env_id: registered id
     :param settings: settings of the run, of which wrappers for training only are left out
+    :param env_kwargs: arguments of the environment that go before those of the run
     :return: vectorised environment with one copy, on the evaluation seeds
     """
     task, _ = split_wrappers(settings.env_wrapper)
 
     def evaluation_env() -> gym.Env:
-        return Monitor(EpisodeSeeds(make_env(env_id, settings.env_kwargs, task)))
+        return Monitor(EpisodeSeeds(make_env(env_id, {**settings.env_kwargs, **(env_kwargs or {})}, task)))
 
-    return stacked(_normalized(DummyVecEnv([evaluation_env]), settings, None, training=False), settings)
+    env = vec_wrapped(DummyVecEnv([evaluation_env]), settings)
+    return stacked(_normalized(env, settings, None, training=False), settings)
 
 
 def attach_monitor_files(env: VecEnv, folder: Path, append: bool = False) -> None:
@@ -246,11 +341,5 @@ def attach_monitor_files(env: VecEnv, folder: Path, append: bool = False) -> Non
     :param folder: run folder
     :param append: go on with files that are there
     """
-    copies = env.unwrapped
-    assert isinstance(copies, DummyVecEnv)
-    for index, copy in enumerate(copies.envs):
-        monitor = unwrap_wrapper(copy, Monitor)
-        assert isinstance(monitor, Monitor)
-        monitor.t_start = time.time()
-        header: dict[str, float | str] = {"t_start": monitor.t_start, "env_id": str(copy.spec.id if copy.spec else None)}
-        monitor.results_writer = ResultsWriter(str(folder / str(index)), header=header, override_existing=not append)
+    for index in range(env.num_envs):
+        env.env_method("write_to", str(folder / str(index)), append, indices=[index])

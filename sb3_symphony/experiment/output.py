@@ -1,9 +1,12 @@
 """Files that a command is told to write: refused before the work begins, and written whole or not at all."""
 
+import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from sb3_symphony.common.checkpoint import write_atomically
 from sb3_symphony.experiment.config import ConfigError
@@ -50,6 +53,47 @@ def output_folder(name: str | Path, flag: str) -> Path:
         raise ConfigError(f"{flag}: '{name}' cannot be written — {error.strerror}") from None
     _try_to_write(path, name, flag)
     return path
+
+
+def check_folder(name: str | Path, flag: str) -> None:
+    """
+    Look whether a folder could be made and written into. Nothing is made.
+
+    :param name: the folder
+    :param flag: the flag that names it, for messages
+    :raises ConfigError: if it could not
+    """
+    path = Path(name).absolute()
+    for folder in (path, *path.parents):
+        try:
+            os.stat(folder)
+        except FileNotFoundError:
+            continue  # to be made
+        except OSError as error:  # no permission to look, a name that is too long, a file in between
+            raise ConfigError(f"{flag}: '{name}' cannot be written — {error.strerror}") from None
+        _try_to_write(folder, name, flag)
+        return
+
+
+@contextmanager
+def report(name: str | None) -> Iterator[Callable[[Any], None]]:
+    """
+    For a command with ``--json``: looks whether the file could be written before the work begins.
+
+    :param name: the file; ``-`` for the terminal, None for nothing
+    :return: what to give the plain values to
+    :raises ConfigError: if the file cannot be written
+    """
+    path = None if name in (None, "-") else output_file(name, "--json")
+
+    def tell(values: Any) -> None:
+        text = json.dumps(values, indent=1, default=str)
+        if name == "-":
+            print(text)
+        elif path is not None:
+            write_output(path, (text + "\n").encode(), "--json")
+
+    yield tell
 
 
 def _try_to_write(folder: Path, name: str | Path, flag: str) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -17,7 +18,7 @@ from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions,
 from sb3_symphony.experiment.run_folder import RunFolder
 
 #: options that may differ from those the run was started with; nothing that is learned depends on them
-_CHANGEABLE = {"n_timesteps", "save_freq", "keep", "verbose", "progress"}
+_CHANGEABLE = {"n_timesteps", "save_freq", "keep", "verbose", "progress", "quiet", "json_file"}
 
 
 @dataclass
@@ -42,7 +43,19 @@ class StoredRun:
         steps = self.steps
         if self.run.checkpoints.is_dir():  # a model may also be that of an interrupted run
             steps = min(steps, max(checkpoint_files(self.run.checkpoints), default=0))
-        return steps >= self.config.settings.n_timesteps
+        return steps >= self.config.settings.n_timesteps or self._stopped_by_reward
+
+    @property
+    def _stopped_by_reward(self) -> bool:
+        """Whether ``stop_reward`` ended it, and its model is saved."""
+        stop_reward, path = self.config.settings.stop_reward, self.run.path / "evaluations.npz"
+        if stop_reward is None or not path.is_file():
+            return False
+        try:
+            with np.load(path) as data:
+                return bool(data["results"][-1].mean() >= stop_reward and self.steps == data["timesteps"][-1])
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            return False
 
     def checkpoint(self) -> Checkpoint | None:
         """
@@ -116,7 +129,7 @@ def open_run(options: TrainOptions) -> StoredRun:
 
     result = StoredRun(run, resumed, config, model_steps(run.model))
     if not result.finished and not run.checkpoints.is_dir():
-        raise ConfigError(f"--resume: '{folder}' has no checkpoints — it was started without --save-freq")
+        raise ConfigError(f"--resume: '{folder}' has no checkpoints — it was started without --save-freq, or with subproc")
     if not result.finished and resumed.save_freq <= 0:
         raise ConfigError(f"--save-freq: {resumed.save_freq} — expected a number > 0 for a run that is resumed")
     return result

@@ -1,7 +1,6 @@
 """One training run, from options to files on disk."""
 
 import errno
-import io
 import shlex
 import time
 from collections.abc import Iterator
@@ -18,27 +17,36 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.plots import plot_training
-from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of, record_episodes, write_atomically
+from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of, record_episodes
+from sb3_symphony.experiment.agent import check_device
 from sb3_symphony.experiment.callbacks import (
     NoteLogFolder,
     ReturnProgressBar,
-    SaveNormalization,
+    SaveBestModel,
     SeededEvaluation,
     StopOnSignal,
     configured_callbacks,
+    save_model,
 )
-from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config
+from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, check_algorithm, load_config
 from sb3_symphony.experiment.decode import algorithm_arguments
 from sb3_symphony.experiment.environment import (
     attach_monitor_files,
+    check_same_spaces,
     check_spaces,
+    import_packages,
     make_evaluation_env,
     make_training_env,
 )
+from sb3_symphony.experiment.output import check_folder
 from sb3_symphony.experiment.protocol import keep_protocol, solved_stride
 from sb3_symphony.experiment.registry import load_algorithm
 from sb3_symphony.experiment.resume import continue_logs, open_run, restore_files
 from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.transfer import find_trained, inherited, start_from
+
+#: options that say what is done with results, or belong to one command among several
+_NOT_OF_THE_RUN = {"resume", "n_seeds", "quiet", "json_file"}
 
 
 @dataclass(frozen=True)
@@ -60,6 +68,18 @@ class TrainResult:
     seconds: float
     interrupted: bool = False
     untouched: bool = False
+
+    def plain(self) -> dict[str, Any]:
+        """:return: the result as plain values, for JSON"""
+        return {
+            "run": str(self.run.path),
+            "model": str(self.run.model),
+            "steps": self.steps,
+            "evaluation": self.evaluation,
+            "mean_reward": float(np.mean(self.evaluation)) if self.evaluation else None,
+            "seconds": round(self.seconds, 3),
+            "interrupted": self.interrupted,
+        }
 
     def summary(self) -> str:
         """:return: one line for the end of a run"""
@@ -87,30 +107,28 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
     :raises ConfigError: if something of the configuration does not fit
     """
     algorithm = load_algorithm(options.algo)
+    check_device(options.device)
+    import_packages(options.gym_packages)
     gamma = config.arguments.get("gamma")
-    env = make_training_env(options.env, config.settings, gamma if isinstance(gamma, int | float) else None, seed)
+    env = make_training_env(
+        options.env,
+        config.settings,
+        gamma if isinstance(gamma, int | float) else None,
+        seed,
+        options.vec_env == "subproc",
+        options.gym_packages,
+    )
     try:
         check_spaces(env, options.env, options.algo, config.settings.policy)
         arguments = algorithm_arguments(options.algo, algorithm, config, env.action_space)
         if options.tensorboard_log:
             arguments["tensorboard_log"] = str(Path(options.tensorboard_log) / options.env.replace("/", "-"))
-        return algorithm(env=env, seed=seed, device=_device(options.device), verbose=verbose, **arguments)
-    except ConfigError:
-        env.close()
-        raise
+        return algorithm(env=env, seed=seed, device=options.device, verbose=verbose, **arguments)
     except (ValueError, TypeError, AssertionError, MemoryError) as error:
         env.close()
+        if isinstance(error, ConfigError):
+            raise
         raise ConfigError(f"{options.algo} on {options.env}: {error}") from error
-
-
-def _device(name: str) -> str:
-    try:
-        device = "cpu" if name == "auto" else th.device(name).type
-    except RuntimeError:
-        device = ""
-    if not device or (device == "cuda" and not th.cuda.is_available()):
-        raise ConfigError(f"--device: '{name}' is not there — expected auto, cpu" + ", cuda" * th.cuda.is_available())
-    return name
 
 
 def _evaluation(
@@ -121,25 +139,23 @@ def _evaluation(
         stop,
         options.threshold,
         solved_stride(options),
-        callback_on_new_best=SaveNormalization(run.best_normalization),
+        stop_reward=config.settings.stop_reward,
+        callback_on_new_best=SaveBestModel(run.best_model, run.best_normalization),
         n_eval_episodes=options.eval_episodes,
         eval_freq=max(options.eval_freq // config.settings.n_envs, 1),
-        log_path=str(run.path),
-        best_model_save_path=str(run.path),
+        log_path=run.path,
         verbose=verbose,
     )
+
+
+def _resumable(options: TrainOptions) -> bool:
+    """Episodes in other processes cannot be recorded."""
+    return options.save_freq > 0 and options.vec_env == "dummy"
 
 
 def _saved_models(options: TrainOptions, config: RunConfig, run: RunFolder) -> CheckpointCallback:
     frequency = max(options.save_freq // config.settings.n_envs, 1)
     return CheckpointCallback(frequency, str(run.path), save_vecnormalize=True)
-
-
-def _writable(folder: str, flag: str) -> None:
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{flag}: '{folder}' cannot be written — {error.strerror}") from None
 
 
 @contextmanager
@@ -167,12 +183,27 @@ def _callbacks(
     options: TrainOptions, config: RunConfig, run: RunFolder, evaluation_env: VecEnv | None, verbose: int
 ) -> tuple[StopOnSignal, SeededEvaluation | None, list[BaseCallback]]:
     """One that stops, one that evaluates if there is an environment for it, and all whose counts belong to the run."""
-    stop = StopOnSignal(at_rollouts=options.save_freq > 0)
+    stop = StopOnSignal(at_rollouts=_resumable(options))
     evaluation = None if evaluation_env is None else _evaluation(options, config, run, evaluation_env, stop, verbose)
     counting: list[BaseCallback] = [evaluation] if evaluation else []
     if options.save_freq > 0:
         counting.append(_saved_models(options, config, run))
     return stop, evaluation, counting
+
+
+def _checkpoints(
+    options: TrainOptions, run: RunFolder, callbacks: list[BaseCallback], checkpoint: Checkpoint | None, stop: StopOnSignal
+) -> ExactCheckpoints:
+    return ExactCheckpoints(
+        run.checkpoints,
+        options.save_freq,
+        options.keep,
+        callbacks=tuple(callbacks),
+        files=run.growing_files,
+        beside=run.saved_models,
+        checkpoint=checkpoint,
+        wanted=stop.here,
+    )
 
 
 def _configured_callbacks(
@@ -189,13 +220,8 @@ def _configured_callbacks(
 
 def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     """The model comes last and at once: a run whose model has all steps has everything."""
-    normalization = model.get_vec_normalize_env()
-    if normalization is not None:
-        normalization.save(str(run.normalization))
     plot_training(run.path)
-    content = io.BytesIO()
-    model.save(content)
-    write_atomically(run.model, content.getvalue())
+    save_model(model, run.model, run.normalization)
 
 
 @contextmanager
@@ -207,6 +233,80 @@ def _full_disk_told(run: RunFolder) -> Iterator[None]:
             raise
         onward = " — once there is room, --resume goes on from the newest checkpoint" if run.checkpoints.is_dir() else ""
         raise ConfigError(f"'{run.path}' cannot be written: {error.strerror}{onward}") from error
+
+
+def effective_config(options: TrainOptions) -> RunConfig:
+    """
+    :param options: options of the command line
+    :return: the merged configuration, with the networks of the agent to start from if there is one
+    :raises ConfigError: if a file or a key of the run is wrong, or there is no such agent
+    """
+    if options.trained_agent is None:
+        return load_config(options)
+    check_algorithm(options.algo)
+    return load_config(options, inherited(find_trained(options)))
+
+
+def prepare(
+    options: TrainOptions, config: RunConfig, seed: int, verbose: int, cleanup: ExitStack, fresh: bool = True
+) -> tuple[BaseAlgorithm, TrainOptions, VecEnv | None, list[BaseCallback]]:
+    """
+    Make everything that a run consists of, and with that check all of its settings. Nothing is written.
+
+    :param options: options of the command line
+    :param config: merged configuration
+    :param seed: seed of environment and model
+    :param verbose: how much the model prints
+    :param cleanup: closes what has to be closed
+    :param fresh: whether the run begins, from a trained agent if the options name one
+    :return: the model, its environment set; the options, completed by the protocol if they name one; an environment for
+        evaluations if there are any; the callbacks of the configuration
+    :raises ConfigError: if something is wrong
+    """
+    if options.with_replay_buffer and options.trained_agent is None:
+        raise ConfigError("--with-replay-buffer: belongs to -i, expected both or neither")
+    model = build_model(options, config, seed, verbose)
+    env = model.get_env()
+    assert env is not None
+    cleanup.callback(env.close)
+    options = keep_protocol(options, config)
+    if config.settings.stop_reward is not None and options.eval_freq <= 0:
+        raise ConfigError(f"stop_reward: {config.settings.stop_reward:g} — needs evaluations, expected --eval-freq > 0")
+    evaluation_env = None
+    if options.eval_freq > 0:
+        evaluation_env = make_evaluation_env(options.env, config.settings, options.eval_env_kwargs)
+        cleanup.callback(evaluation_env.close)
+        check_same_spaces(env, evaluation_env)
+    callbacks = _configured_callbacks(options, config, model, cleanup)
+    if fresh and options.trained_agent is not None:
+        start_from(model, find_trained(options), options.with_replay_buffer)
+    return model, options, evaluation_env, callbacks
+
+
+def train_seeds(options: TrainOptions, command: str | None = None) -> list[TrainResult]:
+    """
+    Train ``n_seeds`` agents one after the other, on the seeds from the given one on. A signal ends the series.
+
+    :param options: options of the command line
+    :param command: the command line, for ``command.txt``
+    :return: what the runs left behind
+    :raises ConfigError: if options or configuration are wrong
+    """
+    if options.n_seeds == 1 or options.resume is not None:
+        return [train(options, command)]
+    # so that the last one is a seed as well
+    first = options.seed if options.seed >= 0 else int(np.random.default_rng().integers(2**31 - options.n_seeds))
+    if first + options.n_seeds > 2**31:
+        raise ConfigError(f"--n-seeds: {options.n_seeds} — seeds from {first} on end at {2**31 - 1}")
+    results: list[TrainResult] = []
+    for seed in range(first, first + options.n_seeds):
+        one = options.model_copy(update={"seed": seed, "n_seeds": 1})
+        results.append(train(one, command and f"{command} --seed {seed} --n-seeds 1"))
+        if results[-1].interrupted:
+            break
+        if not options.quiet and len(results) < options.n_seeds:
+            print(results[-1].summary(), flush=True)
+    return results
 
 
 def train(options: TrainOptions, command: str | None = None, folder: Path | None = None) -> TrainResult:
@@ -223,7 +323,7 @@ def train(options: TrainOptions, command: str | None = None, folder: Path | None
     """
     with ExitStack() as cleanup:
         if options.resume is None:
-            return _train(options, load_config(options), command, cleanup, folder=folder)
+            return _train(options, effective_config(options), command, cleanup, folder=folder)
         stored = open_run(options)
         if stored.finished:
             return TrainResult(stored.run, stored.steps, [], 0.0, untouched=True)
@@ -245,24 +345,19 @@ def _train(
     if options.num_threads > 0:
         th.set_num_threads(options.num_threads)
 
-    model = build_model(options, config, seed, verbose)
+    check_folder(options.log_folder if folder is None else folder.parent, "--log-folder")
+    if options.tensorboard_log:
+        check_folder(options.tensorboard_log, "--tensorboard-log")
+    model, options, evaluation_env, own_callbacks = prepare(options, config, seed, verbose, cleanup, checkpoint is None)
     env = model.get_env()
     assert env is not None
-    cleanup.callback(env.close)
-    options = keep_protocol(options, config)
-    evaluation_env = make_evaluation_env(options.env, config.settings) if options.eval_freq > 0 else None
-    if evaluation_env is not None:
-        cleanup.callback(evaluation_env.close)
-    own_callbacks = _configured_callbacks(options, config, model, cleanup)
-    if options.tensorboard_log:
-        _writable(options.tensorboard_log, "--tensorboard-log")
 
     used = options.model_copy(update={"seed": seed, "n_timesteps": config.settings.n_timesteps, "verbose": verbose})
     command = command or f"sb3-symphony train --algo {options.algo} --env {shlex.quote(options.env)}"
     beginning = ""
     if run is None:
         run = RunFolder.create(options.log_folder, options.algo, options.env, folder)
-        if options.save_freq > 0:
+        if _resumable(options):
             run.checkpoints.mkdir()
             cleanup.enter_context(_alone(run))
         if options.seed < 0:
@@ -271,38 +366,31 @@ def _train(
         beginning = f" ({_resuming(checkpoint, model)})"
         command = f"{run.command}\n{command}"
         restore_files(run, checkpoint)
-    run.write_configuration(used.model_dump(exclude={"resume"}), config.plain, command)
+    run.write_configuration(used.model_dump(exclude=_NOT_OF_THE_RUN), config.plain, command)
     attach_monitor_files(env, run.path, append=checkpoint is not None)
 
     stop, evaluation, callbacks = _callbacks(options, config, run, evaluation_env, verbose)
     callbacks += own_callbacks
     checkpoints = None
-    if options.save_freq > 0:
+    if _resumable(options):
         record_episodes(env)
-        checkpoints = ExactCheckpoints(
-            run.checkpoints,
-            options.save_freq,
-            options.keep,
-            callbacks=tuple(callbacks),
-            files=run.growing_files,
-            beside=run.saved_models,
-            checkpoint=checkpoint,
-            wanted=stop.here,
-        )
+        checkpoints = _checkpoints(options, run, callbacks, checkpoint, stop)
         callbacks.append(checkpoints)
     callbacks += [stop, NoteLogFolder(run.log_folder)]  # the checkpoint is made before
     if options.progress:
         bar = ReturnProgressBar(evaluation)
         callbacks.append(bar)
         cleanup.callback(bar.close)
-    learn_arguments: dict[str, Any] = {}
-    if options.log_interval != -1:
-        learn_arguments["log_interval"] = None if options.log_interval == -2 else options.log_interval
+    intervals: dict[int, dict[str, Any]] = {-1: {}, -2: {"log_interval": None}}
+    learn_arguments = intervals.get(options.log_interval, {"log_interval": options.log_interval})
     if checkpoint is not None:
         continue_logs(model, checkpoint, learn_arguments)
 
     total = config.settings.n_timesteps
-    print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
+    if not options.quiet:
+        print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
+        if options.save_freq > 0 and not _resumable(options):
+            print("note: --save-freq saves models only, as --resume needs --vec-env dummy", flush=True)
     with stop.listening(), _full_disk_told(run):
         try:
             model.learn(total, callback=callbacks, **learn_arguments)

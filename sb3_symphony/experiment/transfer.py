@@ -1,0 +1,150 @@
+"""Training that starts from a trained agent: ``train -i``."""
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.save_util import load_from_pkl, recursive_getattr
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
+
+from sb3_symphony.common.checkpoint import DamagedCheckpoint, ReplaySegments, add_transitions, newest_checkpoint
+from sb3_symphony.experiment.agent import check_match, load_model, load_normalization
+from sb3_symphony.experiment.config import ConfigError, TrainOptions, read_yaml
+from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.select import Selection, SelectOptions, select_model
+
+#: what settles the networks of an agent and what they are given: taken from the run that trained it
+_NETWORKS = ("policy", "policy_kwargs", "n_critics", "use_sde", "normalize", "frame_stack")
+
+
+def find_trained(options: TrainOptions) -> Selection:
+    """
+    :param options: options of the command line, ``trained_agent`` among them
+    :return: the agent to start from
+    :raises ConfigError: if there is none, or another algorithm trained it
+    """
+    wanted = SelectOptions(model=options.trained_agent, algo=options.algo, env=options.env)
+    try:
+        return select_model(wanted)
+    except ConfigError as error:
+        raise ConfigError(f"-i: {str(error).removeprefix('--model: ').partition(' — see --')[0]}") from None
+
+
+def inherited(selection: Selection) -> dict[str, Any]:
+    """
+    :param selection: the agent to start from
+    :return: keys of its run's configuration that its networks depend on; none for a file outside a run folder
+    """
+    if selection.run is None:
+        return {}
+    (path,) = sorted(selection.run.glob("*/config.yml"))[:1]
+    config = read_yaml(path)
+    return {key: config.get(key) for key in _NETWORKS if config.get(key) is not None or key in ("normalize", "frame_stack")}
+
+
+def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: bool) -> None:
+    """
+    Give a new model weights, optimiser states and statistics of ``VecNormalize`` of a trained one, and its experience if
+    wanted. Counters and schedules start anew; learning rates and other settings are the configuration's.
+
+    :param model: a new model with its environment
+    :param selection: the agent to start from
+    :param with_replay_buffer: whether its replay buffer is taken over
+    :raises ConfigError: if spaces or networks differ, or something is missing or damaged
+    """
+    env = model.get_env()
+    assert env is not None
+    normalization = unwrap_vec_normalize(env)
+    unknown = ConfigError(
+        f"-i: {selection.model}: its statistics of VecNormalize are not known — expected it in its run folder"
+    )
+    if normalization is not None and selection.normalization is None:
+        raise unknown
+    try:
+        trained = load_model(selection, str(model.device))
+    except ConfigError as error:
+        if "--vecnormalize" in str(error):  # a flag of other commands
+            raise unknown from None
+        raise ConfigError(f"-i: {error}") from None
+    check_match(trained, env, selection)
+    _take_networks(model, trained, selection)
+    if normalization is not None and selection.normalization is not None:
+        stored = load_normalization(selection.normalization, normalization.venv)
+        normalization.obs_rms, normalization.ret_rms = stored.obs_rms, stored.ret_rms
+    if with_replay_buffer:
+        _take_experience(model, selection)
+
+
+def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, selection: Selection) -> None:
+    given, (names, tensors) = trained.get_parameters(), model._get_torch_save_params()
+    try:
+        for name in names:
+            target = recursive_getattr(model, name)
+            if isinstance(target, th.optim.Optimizer):
+                if name not in given:  # such as that of an entropy coefficient that was fixed
+                    continue
+                settings = [{k: v for k, v in group.items() if k != "params"} for group in target.param_groups]
+                target.load_state_dict(given[name])  # type: ignore[arg-type]
+                for group, own in zip(target.param_groups, settings, strict=True):
+                    group.update(own)
+            else:
+                target.load_state_dict(given[name], strict=True)
+    except (RuntimeError, ValueError, KeyError) as error:
+        what = str(error).strip().splitlines()[-1].strip()
+        raise ConfigError(
+            f"-i: networks of {selection.model} (policy_kwargs {trained.policy_kwargs}) do not fit the configuration's "
+            f"({model.policy_kwargs}) — {what}"
+        ) from None
+    known = set(trained._get_torch_save_params()[1]) - {"ent_coef_tensor"}  # which the configuration fixes
+    for name in known & set(tensors):
+        recursive_getattr(model, name).data.copy_(recursive_getattr(trained, name))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Experience
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _take_experience(model: BaseAlgorithm, selection: Selection) -> None:
+    buffer = getattr(model, "replay_buffer", None)
+    if not isinstance(buffer, ReplayBuffer):
+        raise ConfigError(f"--with-replay-buffer: {selection.algo} has no replay buffer")
+    parts, source = _experience(selection)
+    try:
+        taken = add_transitions(buffer, parts)
+    except DamagedCheckpoint as error:
+        raise ConfigError(f"--with-replay-buffer: {source}: {error}") from None
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"--with-replay-buffer: {source} — {error}") from None
+    if not taken:
+        raise ConfigError(f"--with-replay-buffer: {source} is empty")
+
+
+def _experience(selection: Selection) -> tuple[Iterator[dict[str, np.ndarray]], Path]:
+    """Transitions of a run's newest checkpoint, or of a buffer that SB3 or RL Zoo saved beside the model."""
+    pickled = selection.model.with_name("replay_buffer.pkl")
+    if selection.run is not None and not pickled.is_file():
+        run = RunFolder(selection.run, "")
+        try:
+            checkpoint = newest_checkpoint(run.checkpoints)
+        except DamagedCheckpoint as error:
+            raise ConfigError(f"--with-replay-buffer: {run.checkpoints} — {error}") from None
+        if checkpoint is not None:
+            return ReplaySegments(run.checkpoints, checkpoint.state["segments"]).transitions(), run.checkpoints
+    if not pickled.is_file():
+        raise ConfigError(
+            f"--with-replay-buffer: {selection.model.parent} has neither checkpoints (`train --save-freq`) nor {pickled.name}"
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of old pickles
+            stored = load_from_pkl(pickled)
+        assert isinstance(stored, ReplayBuffer), f"a {type(stored).__name__}"
+    except Exception as error:  # a pickle can fail in any way
+        raise ConfigError(f"{pickled}: not a replay buffer of SB3, or damaged — {type(error).__name__}: {error}") from error
+    return iter([ReplaySegments.of(stored)]), pickled
