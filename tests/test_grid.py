@@ -304,13 +304,21 @@ def test_a_cell_whose_worker_dies_does_not_go_on(job):
     assert not Path(f"/proc/{children[0]}").exists()
 
 
-def test_a_cell_saves_and_stops_when_nobody_is_left_to_tell(job, monkeypatch):
+def test_a_cell_saves_and_stops_when_nobody_is_left_to_tell(job):
     """As if the machine of the one who started the grid had gone: no sign of life any more."""
-    code = (
-        "from sb3_symphony.experiment import cell; cell.PATIENCE = 1.0; import sys; sys.stdin = open(0); sys.exit(cell.main())"
-    )
-    ended = subprocess.run([sys.executable, "-c", code], input=json.dumps(vars(job)), text=True, capture_output=True)
-    assert ended.returncode in (cell_module._STOPPED, -signal.SIGTERM), ended.stderr  # the latter while still importing
+    code = "import sys; from sb3_symphony.experiment import cell; cell.PATIENCE = 3.0; sys.exit(cell.main())"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, text=True)
+    process.stdin.write(json.dumps(vars(job)))
+    process.stdin.close()
+    control, run = job.control, Path(job.run)
+
+    def alive_until_checkpoint():
+        control.say(0)
+        return list(run.glob("checkpoints/*.ckpt"))
+
+    wait_for(alive_until_checkpoint, process)
+    assert process.wait() == cell_module._STOPPED
+    assert (run / "Pendulum-v1.zip").is_file() and not (run / "result.json").exists()
 
 
 def test_reading_while_it_is_written(folder):
@@ -358,7 +366,20 @@ def test_a_folder_that_is_not_shared_is_refused(cluster, folder, capsys):
     assert [path.name for path in folder.iterdir()] == ["study.yml"]
 
 
-def test_a_worker_of_ray_that_dies_is_replaced(cluster, folder):
+@pytest.fixture
+def die_once():
+    """A function that ends its process the first time. Not importable, so that it travels to workers as it is."""
+
+    def once(path):
+        if Path(path).exists():
+            return "second time"
+        Path(path).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    return once
+
+
+def test_a_worker_of_ray_that_dies_is_replaced(cluster, folder, die_once):
     from sb3_symphony.experiment.backends import open_backend
 
     backend = open_backend("ray", address=cluster.address)
@@ -369,28 +390,17 @@ def test_a_worker_of_ray_that_dies_is_replaced(cluster, folder):
     assert results == {str(folder / "a"): "second time", str(folder / "b"): "second time"}
 
 
-def die_once(path):
-    if Path(path).exists():
-        return "second time"
-    Path(path).touch()
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_a_worker_of_loky_that_dies_is_replaced(folder):
+def test_a_worker_of_loky_that_dies_is_replaced(folder, die_once):
     from sb3_symphony.experiment.backends import open_backend
 
     backend = open_backend("loky", n_jobs=2)
     try:
         results = dict(backend.map(die_once, [str(folder / name) for name in "abc"]))
         assert results == {str(folder / name): "second time" for name in "abc"}
-        (_, error) = next(iter(backend.map(die_always, [0])))
+        ((_, error),) = backend.map(lambda _: os.kill(os.getpid(), signal.SIGKILL), [0])
         assert isinstance(error, Exception)
     finally:
         backend.close()
-
-
-def die_always(item):
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -377,7 +377,8 @@ class _Session:
         while not self.ended.empty():
             job, outcome = self.ended.get()
             if isinstance(outcome, Exception):
-                outcome = Outcome("failed", f"its worker died — {type(outcome).__name__}")
+                told = str(outcome).strip().splitlines() or [type(outcome).__name__]
+                outcome = Outcome("failed", f"its worker died — {told[-1]}")
             elif outcome.state == "stopped" and not self.stop:
                 outcome = Outcome("failed", "was stopped by a signal from elsewhere")
             each = self.left[job.name]
