@@ -103,6 +103,7 @@ def descendants(pid: int) -> list[int]:
     """
     try:
         children = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        children = [child for child in children if ") Z" not in Path(f"/proc/{child}/stat").read_text()]
     except OSError:
         return []
     return [*children, *(below for child in children for below in descendants(child))]

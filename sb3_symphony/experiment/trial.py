@@ -171,6 +171,7 @@ class TrialProcesses:
     :param config: its configuration
     :param seeds: one training for each
     :param n_evaluations: number of evaluations of each
+    :raises TrialFailed: if the system starts no more processes
     """
 
     def __init__(self, options: TrainOptions, config: RunConfig, seeds: Sequence[int], n_evaluations: int) -> None:
@@ -180,14 +181,18 @@ class TrialProcesses:
         self.returns: list[list[float]] = [[] for _ in seeds]  # mean of each evaluation, for each seed
         self._results: list[Connection] = []
         self._processes: list[Any] = []
+        self.reported = 0
         for seed in seeds:
             receiver, sender = context.Pipe(duplex=False)
             process = context.Process(target=_train_seed, args=(options, config, seed, n_evaluations, sender))
-            process.start()
+            try:
+                process.start()
+            except (OSError, EOFError) as error:  # EOFError: the process that all are forked from has just died
+                self.stop()
+                raise TrialFailed(f"seed {seed}: its process could not be started ({error})", "died") from None
             sender.close()  # the process has its own; when that one closes too, there is nothing more to come
             self._results.append(receiver)
             self._processes.append(process)
-        self.reported = 0
 
     @property
     def connections(self) -> list[Connection]:

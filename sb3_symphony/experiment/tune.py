@@ -301,11 +301,13 @@ class Sweep:
         try:
             config = merge(self.plan.configuration, self.options.training(values))
             evaluation_frequency(config, self.options.n_evaluations)
+            processes = TrialProcesses(self._training, config, self.options.seeds, self.options.n_evaluations)
         except ConfigError as error:
             self._tell(study, trial, TrialState.FAIL, {REASON: str(error), ENDED: "failed"})
-            return True
-        processes = TrialProcesses(self._training, config, self.options.seeds, self.options.n_evaluations)
-        self._running.append(_Running(study, trial, processes))
+        except TrialFailed as failure:
+            self._tell(study, trial, TrialState.FAIL, {REASON: failure.reason, ENDED: failure.kind})
+        else:
+            self._running.append(_Running(study, trial, processes))
         return True
 
     # Following --------------------------------------------------------------------------------------------------------
