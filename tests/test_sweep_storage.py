@@ -100,7 +100,7 @@ def test_patience_ends(tmp_path, opened, monkeypatch):
     storage.patience.seconds = 0.3
     before = path.read_bytes()
     path.rename(tmp_path / "elsewhere.log")
-    with pytest.raises(StorageAway, match="has been away for 0.3 s .No such file.*the same command goes on"):
+    with pytest.raises(StorageAway, match=r"has been away for 0.3 s \(No such file.*the same command goes on"):
         study.set_user_attr("a", 1)
     assert not path.exists()  # a journal that is gone is not begun anew
     (tmp_path / "elsewhere.log").rename(path)

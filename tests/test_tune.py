@@ -218,7 +218,7 @@ def test_parameters_that_cannot_be_combined_are_a_reason_too(played, options, tm
     found = {}
     for trial in trials_of(options()):
         bad = (trial.params["n_envs"], trial.params["n_timesteps"]) == (8, 12)
-        found[bad] = found.get(bad, []) + [(trial.state, reason_of(trial))]
+        found[bad] = [*found.get(bad, []), (trial.state, reason_of(trial))]
     assert set(found[False]) == {(COMPLETE, "")}
     assert {state for state, _ in found[True]} == {FAIL} and "--n-evaluations: 3" in found[True][0][1]
 
@@ -339,9 +339,9 @@ def test_a_study_of_somebody_else_is_left_alone(played, options, tmp_path):
     study.add_trial(optuna.create_trial(value=1.0))
     storage.close()
     for show in (False, True):
-        with pytest.raises(ConfigError, match="'theirs' in journal.log was not made by this command"):
+        with pytest.raises(ConfigError, match=r"'theirs' in journal\.log was not made by this command"):
             tune(options(storage="journal.log", study_name="theirs", show=show))
-    with pytest.raises(ConfigError, match="no study 'their' in journal.log: did you mean 'theirs'?"):
+    with pytest.raises(ConfigError, match=r"no study 'their' in journal\.log: did you mean 'theirs'"):
         tune(options(storage="journal.log", study_name="their", show=True))
 
 

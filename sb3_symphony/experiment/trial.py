@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import textwrap
 import threading
 import traceback
 import warnings
@@ -81,7 +82,7 @@ def _finite_weights(model: BaseAlgorithm) -> bool:
 
 def _failure(error: Exception, model: BaseAlgorithm | None) -> _Failure:
     """Tell what hyper-parameters and environments can cause from mistakes in the program, which must not pass for it."""
-    what = " ".join(f"{type(error).__name__}: {error}".split())
+    what = textwrap.shorten(f"{type(error).__name__}: {error}", 300, placeholder=" …")
     if isinstance(error, ConfigError):
         return _Failure(str(error), "failed")
     if isinstance(error, _Diverged):
