@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sb3_symphony.common.checkpoint import write_atomically
 from sb3_symphony.experiment.config import ConfigError
 
 
@@ -110,6 +109,8 @@ def write_output(path: Path, content: bytes, flag: str) -> None:
     :param flag: the flag that names the file, for messages
     :raises ConfigError: if it cannot be written, because the disk is full for example
     """
+    from sb3_symphony.common.checkpoint import write_atomically  # which loads torch: not to look whether a file can be written
+
     try:
         write_atomically(path, content)
     except OSError as error:

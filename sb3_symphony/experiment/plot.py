@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.output import output_file
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.plots import Curve, Line
@@ -59,9 +60,9 @@ def plot(options: PlotOptions) -> Path:
         groups = _groups(options)
         output = Path(options.output or _default_output(options, groups))
         style.check_suffix(output)
-        _check_file(output, "--output")
+        output_file(options.output or output, "--output")
         if options.json_file not in (None, "-"):
-            _check_file(Path(str(options.json_file)), "--json")
+            output_file(str(options.json_file), "--json")
         panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
     except ValueError as error:
         raise ConfigError(str(error)) from None
@@ -93,14 +94,6 @@ def _check(options: PlotOptions) -> None:
         raise ConfigError(f"-y: {options.y_axis} — is for episodes, not for --scalars")
     if options.runs and (options.algo or options.env):
         raise ConfigError(f"{options.runs[0]}: expected run folders, or -a and -e to look for runs, not both")
-
-
-def _check_file(path: Path, flag: str) -> None:
-    # experiment.output does more, but loads torch
-    if path.is_dir():
-        raise ConfigError(f"{flag}: '{path}' cannot be written — it is a folder")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{flag}: '{path}' cannot be written — there is no folder {path.parent}")
 
 
 def _groups(options: PlotOptions) -> "list[Group]":
