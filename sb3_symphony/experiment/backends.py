@@ -174,8 +174,9 @@ class Ray:
         try:
             ray.init(**arguments)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            where = "a local cluster cannot be started" if address is None else f"--address: '{address}'"
-            raise ConfigError(f"{where} — {error}") from None
+            if address is None:
+                raise ConfigError(f"--backend: Ray cannot be started here — {error}") from None
+            raise ConfigError(f"--address: '{address}' — {error} (is RAY_AUTH_MODE the cluster's?)") from None
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[Item, Result | Exception]]:
         """See :meth:`Backend.map`."""
