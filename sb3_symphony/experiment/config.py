@@ -340,7 +340,7 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
     :return: where it stands, and the entry
     :raises ConfigError: if there is none, or the file cannot be read
     """
-    path = Path(options.conf_file or shipped_folder() / f"{options.algo}.yml")
+    path = Path(shipped_folder() / f"{options.algo}.yml" if options.conf_file is None else options.conf_file)
     preset = shipped_folder() / "presets" / f"{path}.yml"
     if preset.is_file() and not path.exists():
         path = preset
