@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from sb3_symphony.analysis.runs import open_run
-from sb3_symphony.analysis.tables import Result, Thresholds, as_csv, episode_rows, markdown_table, run_row
+from sb3_symphony.analysis.tables import EPISODE_COLUMNS, Result, Thresholds, as_csv, episode_rows, markdown_table, run_row
 
 WALKER = Thresholds(300.0, 200.0)
 
@@ -23,7 +23,7 @@ def result(tmp_path):
         (path / "X-v0").mkdir(parents=True)
         rows = [f"{value},500,{k}" for k, value in enumerate(training)]
         (path / "0.monitor.csv").write_text("\n".join(['#{"t_start": 5.0}', "r,l,t", *rows]) + "\n")
-        results = np.array([[mean - 1, mean + 1] for mean in evaluations], dtype=float)
+        results = np.array([[mean - 1, mean + 1] for mean in evaluations], dtype=float).reshape(-1, 2)
         steps = 1000 * np.arange(1, len(evaluations) + 1)
         np.savez(path / "evaluations.npz", timesteps=steps, results=results, ep_lengths=np.full(results.shape, 7))
         used = {"algo": "td3", "env": "X-v0", "seed": seed, "protocol": "standard", **options}
@@ -47,6 +47,10 @@ def table_of(results):
     rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in rest[:end]]
     assert {len(row) for row in [names, rule, *rest[:end]]} == {len(names)}  # aligned
     return [dict(zip(columns, row, strict=True)) for row in rows], rest[end + 1 :]
+
+
+def rows_of(text):
+    return list(csv.DictReader(io.StringIO(text)))
 
 
 def test_markdown_by_hand(result):
@@ -129,7 +133,7 @@ def test_a_row_for_each_run(result):
         result("b", 4, [0, 0], [0, 10], done=False, protocol=None),
         Result("c", "X-v0", 5, WALKER, None, None),
     ]
-    a, b, c = csv.DictReader(io.StringIO(as_csv(map(run_row, results))))
+    a, b, c = rows_of(as_csv(run_row(results[0]), map(run_row, results)))
     assert (a["algorithm"], a["environment"], a["seed"], a["protocol"], a["done"]) == ("a", "X-v0", "0", "standard", "1")
     assert (a["stable_reached"], a["stable_step"], a["stable_episode"]) == ("1", "2000", "")
     assert (a["first_reached"], a["first_step"], a["first_episode"]) == ("1", "1000", "2")
@@ -143,7 +147,7 @@ def test_a_row_for_each_run(result):
 
 def test_a_row_for_each_episode(result):
     results = [result("a", 0, [100, 310], [0, 301, 50], final=[1.5, 3.0]), Result("c", "X-v0", 5, WALKER, None, None)]
-    rows = list(csv.DictReader(io.StringIO(as_csv(episode_rows(results)))))
+    rows = rows_of(as_csv(EPISODE_COLUMNS, episode_rows(results)))
     assert {(row["algorithm"], row["environment"], row["seed"]) for row in rows} == {("a", "X-v0", "0")}
     kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in ("training", "evaluation", "final")}
     assert sum(map(len, kinds.values())) == len(rows)
@@ -158,3 +162,14 @@ def test_a_row_for_each_episode(result):
     assert column("evaluation", "environment_seed") == [10_000, 10_001] * 2
     assert column("final", "return") == [1.5, 3.0] and column("final", "environment_seed") == [20_000, 20_001]
     assert column("final", "step") == [1500, 1500] and column("final", "success") == [None, 1]
+
+
+def test_before_the_first_episode(result):
+    """Of a grid that was interrupted soon: no monitored episode, no evaluation, nothing done."""
+    results = [result("a", 0, [], [], done=False), Result("a", "X-v0", 1, WALKER, None, None)]
+    assert as_csv(EPISODE_COLUMNS, episode_rows(results)) == ",".join(EPISODE_COLUMNS) + "\n"
+    first, second = rows_of(as_csv(run_row(results[0]), map(run_row, results)))
+    assert (first["done"], first["stable_reached"], first["stable_step"], first["best_evaluation"]) == ("0", "0", "0", "")
+    assert second["stable_step"] == ""
+    (row,), _ = table_of(results)
+    assert row["seeds"] == "0 of 2"

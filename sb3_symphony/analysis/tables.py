@@ -80,17 +80,22 @@ class Result:
 Row = dict[str, Any]
 
 
-def as_csv(rows: Iterable[Row]) -> str:
+#: of :func:`episode_rows`
+EPISODE_COLUMNS = (
+    *("algorithm", "environment", "seed"),
+    *("kind", "step", "episode", "environment_seed", "return", "length", "success"),
+)
+
+
+def as_csv(columns: Iterable[str], rows: Iterable[Row]) -> str:
     """
-    :param rows: column → value, the same columns in each; at least one
-    :return: the rows as text, with a line of names; None is empty
+    :param columns: names of the columns
+    :param rows: column → value
+    :return: the rows as text, under a line of names; None is empty
     """
-    rows = iter(rows)
-    first = next(rows)
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(first), lineterminator="\n")
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
     writer.writeheader()
-    writer.writerow(first)
     writer.writerows(rows)
     return text.getvalue()
 
@@ -113,13 +118,12 @@ def episode_rows(results: Iterable[Result]) -> Iterator[Row]:
     :return: a row for each episode: of training (``step`` is that of its end), of an evaluation in its course (``step`` is
         that of the training), and of the evaluation at the end
     """
-    columns = ("kind", "step", "episode", "environment_seed", "return", "length", "success")
 
     def rows(result: Result, kind: str, steps: Any, seeds: Any, returns: Any, lengths: Any, successes: Any) -> Iterator[Row]:
         n = len(returns)
-        all_columns = ([kind] * n, steps, range(1, n + 1), seeds, returns, lengths, successes)
-        for values in zip(*(_plain(values, n) for values in all_columns), strict=True):
-            yield {**_of(result), **dict(zip(columns, values, strict=True))}
+        columns = ([kind] * n, steps, range(1, n + 1), seeds, returns, lengths, successes)
+        for values in zip(*(_plain(values, n) for values in columns), strict=True):
+            yield dict(zip(EPISODE_COLUMNS, (*_of(result).values(), *values), strict=True))
 
     for result in results:
         if result.run is None:

@@ -403,7 +403,7 @@ def report(title: str, progress: Sequence[Progress], folder: Path) -> str:
     :return: the Markdown tables
     :raises ConfigError: if a file of a run is damaged, or nothing can be written
     """
-    from sb3_symphony.analysis.tables import as_csv, episode_rows, markdown_table, run_row
+    from sb3_symphony.analysis.tables import EPISODE_COLUMNS, as_csv, episode_rows, markdown_table, run_row
     from sb3_symphony.common.checkpoint import write_atomically
 
     try:
@@ -413,10 +413,9 @@ def report(title: str, progress: Sequence[Progress], folder: Path) -> str:
             for env in dict.fromkeys(each.environment for each in results)
         ]
         table = "\n".join([f"## {title}", "", *map(markdown_table, by_environment)])
-        files = {"cells.csv": as_csv(map(run_row, results)), "table.md": table}
-        if any(each.run is not None and each.run.episodes is not None for each in results):
-            files["episodes.csv"] = as_csv(episode_rows(results))
-        for name, content in files.items():
+        rows = [run_row(each) for each in results]
+        cells, episodes = as_csv(rows[0], rows), as_csv(EPISODE_COLUMNS, episode_rows(results))
+        for name, content in {"table.md": table, "cells.csv": cells, "episodes.csv": episodes}.items():
             write_atomically(folder / name, content.encode())
         _draw(by_environment, folder)
     except ValueError as error:
