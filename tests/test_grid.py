@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from filelock import FileLock
 from resume_helpers import assert_same_results
 from test_cli import fails
 
@@ -66,9 +68,13 @@ def write_study(folder, **changes):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Results of a grid that nothing has happened to."""
-    folder = tmp_path_factory.mktemp("whole")
-    assert main(["bench", str(write_study(folder)), "-j", "2", "-f", str(folder / "results")]) == 0
+    """Results of a grid that nothing has happened to. Not to be changed: processes of pytest-xdist share them."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "whole"
+    with FileLock(f"{folder}.lock"):
+        if not folder.exists():
+            folder.mkdir()
+            assert main(["bench", str(write_study(folder)), "-j", "2", "-f", str(folder / "results")]) == 0
     return folder / "results"
 
 
@@ -135,17 +141,19 @@ def test_a_cell_is_the_run_of_its_command(whole, folder):
 
 def test_done_cells_stay_as_they_are_and_reports_are_made_anew(whole, folder, capsys):
     study = str(whole.parent / "study.yml")
-    before = contents(*(whole / name for name in CELLS))
-    reports = {path: path.read_bytes() for path in whole.iterdir() if path.is_file()}
-    assert main(["bench", study, "-f", str(whole)]) == 0
+    results = folder / "results"
+    shutil.copytree(whole, results)
+    before = contents(*(results / name for name in CELLS))
+    reports = {path: path.read_bytes() for path in results.iterdir() if path.is_file()}
+    assert main(["bench", study, "-f", str(results)]) == 0
     out = capsys.readouterr().out
-    assert "cells to do" not in out and "### Pendulum-v1" in out and f"results in {whole}" in out
+    assert "cells to do" not in out and "### Pendulum-v1" in out and f"results in {results}" in out
     for path in reports:
         if path.suffix in (".csv", ".md", ".png"):
             path.unlink()
-    assert main(["bench", study, "-f", str(whole), "--report"]) == 0
+    assert main(["bench", study, "-f", str(results), "--report"]) == 0
     assert {path: path.read_bytes() for path in reports} == reports
-    assert contents(*(whole / name for name in CELLS)) == before
+    assert contents(*(results / name for name in CELLS)) == before
 
 
 def test_raw_results_suffice_for_the_report(whole, folder):
@@ -260,12 +268,10 @@ def test_a_failed_cell_stops_nothing(folder, monkeypatch, capsys):
     assert "Traceback" in (folder / "results" / "td3" / "Raise-v0_0.log").read_text()
 
 
-def test_two_at_once_are_refused(whole, folder, capsys):
-    from filelock import FileLock
-
-    study = write_study(folder, seeds=4)
-    with FileLock(whole / ".lock"):
-        assert "is being worked on by another process" in fails(capsys, "bench", str(study), "-f", str(whole))
+def test_two_at_once_are_refused(folder, capsys):
+    (folder / "results").mkdir()
+    with FileLock(folder / "results" / ".lock"):
+        assert "is being worked on by another process" in fails(capsys, "bench", str(write_study(folder)), "-f", "results")
 
 
 # ----------------------------------------------------------------------------------------------------------------------
