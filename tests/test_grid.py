@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -430,6 +431,27 @@ def test_mistakes_in_a_study_leave_nothing(folder, capsys, changes, message):
     study = write_study(folder, **changes)
     assert message in fails(capsys, "bench", str(study))
     assert [path.name for path in folder.iterdir()] == ["study.yml"]
+
+
+def test_what_others_have_put_there_is_not_touched(folder, capsys):
+    study = str(write_study(folder))
+    mine = folder / "logs" / "td3" / "Pendulum-v1_1"
+    (mine / "Pendulum-v1").mkdir(parents=True)
+    (mine / "Pendulum-v1" / "config.yml").touch()  # so far it might be of a process that died as its run began
+    (mine / "thesis.txt").write_text("all my work")
+    message = fails(capsys, "bench", study, "-f", "logs")
+    assert "Pendulum-v1_1' is there already, with thesis.txt — expected another -f" in message
+    assert (mine / "thesis.txt").read_text() == "all my work"
+
+
+def test_a_process_that_died_as_its_run_began(job):
+    run = Path(job.run)
+    (run / "Pendulum-v1").mkdir(parents=True)
+    (run / "checkpoints").mkdir()
+    for name in ("Pendulum-v1/config.yml", "Pendulum-v1/.command.txt.tmp", "checkpoints/.lock"):
+        (run / name).touch()
+    assert supervise(replace(job, options={**job.options, "n_timesteps": 210})) == Outcome("done")
+    assert json.loads((run / "result.json").read_text())["steps"] == 210
 
 
 def test_other_mistakes_leave_nothing(folder, capsys):

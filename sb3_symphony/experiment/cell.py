@@ -202,6 +202,21 @@ def read_result(run: Path) -> dict[str, Any] | None:
         return None
 
 
+def begun(run: RunFolder) -> bool:
+    """
+    :param run: folder of a cell
+    :return: whether its run has begun; else there is nothing, or what a process left that died before
+    :raises ConfigError: if something else is there
+    """
+    if (run.details / "args.yml").is_file():
+        return True
+    files = [path for path in run.path.rglob("*") if path.is_file()]
+    for path in files:
+        if path.name not in ("config.yml", "command.txt", ".lock") and path.suffix != ".tmp":
+            raise ConfigError(f"'{run.path}' is there already, with {path.name} — expected another -f")
+    return False
+
+
 def _command(options: TrainOptions) -> str:
     """The command line that does the same as a cell, but for the name of its folder."""
     flags = {
@@ -235,12 +250,12 @@ def run_cell(job: Job) -> bool:
 
     options = TrainOptions.model_validate(job.options)
     run = RunFolder(Path(job.run), RunFolder.file_name(options.env))
-    if (run.details / "args.yml").is_file():
+    if begun(run):
         again = TrainOptions(resume=str(run.path), n_timesteps=options.n_timesteps, save_freq=options.save_freq)
         result = train(again, _command(options))
     else:
         if run.path.exists():
-            shutil.rmtree(run.path)  # of a process that died before its run had begun
+            shutil.rmtree(run.path)
         result = train(options, _command(options), run.path)
     if result.interrupted:
         return False

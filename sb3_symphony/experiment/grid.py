@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from sb3_symphony.experiment.cell import Control, Job, Outcome, read_result, supervise
+from sb3_symphony.experiment.cell import Control, Job, Outcome, begun, read_result, supervise
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, parse_yaml, read_yaml
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.signals import handled_by
@@ -177,7 +177,7 @@ def _standing(cell: Cell, folder: Path) -> Progress:
     config = configuration(cell)
     run = RunFolder(folder / cell.name, RunFolder.file_name(cell.environment.id))
     progress = Progress(cell, config, run)
-    if not (run.details / "args.yml").is_file():
+    if not begun(run):
         return progress
     _check_same(progress)
     progress.look()
