@@ -213,6 +213,16 @@ def test_variants(killed, capsys, name):
         assert difference([a["obs_rms"], a["ret_rms"]], [b["obs_rms"], b["ret_rms"]]) is None
 
 
+def test_environments_in_processes(killed, capsys):
+    chosen = {"hyperparams": {**SMALL, "n_envs": 2, "normalize": True}, "vec_env": "subproc"}
+    whole = train(options("sac", log_folder="a", n_timesteps=450, **chosen)).run.path
+    run = killed(330, options("sac", log_folder="b", n_timesteps=450, **chosen))
+    resume(run)
+    assert "(resumed at 300)" in capsys.readouterr().out
+    assert len(monitor_rows(run / "1.monitor.csv")) == 2
+    assert_same_results(whole, run)
+
+
 def test_evaluations_and_saved_models(killed, logged):
     chosen = {"eval_freq": 60, "eval_episodes": 2}
     whole = train(options("sac", log_folder="a", **chosen)).run.path

@@ -243,14 +243,6 @@ def test_kinds_of_environments():
         make_training_env("Pendulum-v9", RunSettings(n_timesteps=1), None, 0, True)
 
 
-def test_processes_are_not_resumable(capsys):
-    run = train(options(vec_env="subproc", save_freq=50, quiet=False)).run
-    assert "saves models only" in capsys.readouterr().out
-    assert (run.path / "rl_model_100_steps.zip").exists() and not run.checkpoints.exists()
-    with pytest.raises(ConfigError, match="has no checkpoints"):
-        train(TrainOptions(resume=str(run.path), n_timesteps=500))
-
-
 def test_own_robot(folder, monkeypatch, capsys):
     """Trained, then used by another command."""
     (folder / "my_robot2.py").write_text(OWN_ENV.replace("Robot", "Robot2"))

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_normalize,
 )
 
+from sb3_symphony.common.checkpoint import RecordedEpisode
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
 from sb3_symphony.experiment.config import ConfigError, RunSettings
@@ -285,6 +286,7 @@ def make_training_env(
     seed: int,
     subprocesses: bool = False,
     packages: list[str] | None = None,
+    recorded: bool = False,
 ) -> VecEnv:
     """
     :param env_id: registered id
@@ -293,6 +295,7 @@ def make_training_env(
     :param seed: environment ``i`` gets ``seed + i``
     :param subprocesses: whether each copy gets a process of its own
     :param packages: modules that register environments, which such a process has to import
+    :param recorded: whether episodes are recorded, for checkpoints
     :return: vectorised environment whose monitors do not write yet (see :func:`attach_monitor_files`)
     """
     task, training = split_wrappers(settings.env_wrapper)
@@ -300,7 +303,7 @@ def make_training_env(
     def one(index: int) -> gym.Env:
         env = _wrapped(RunMonitor(make_env(env_id, settings.env_kwargs, task)), training)
         env.action_space.seed(seed + index)
-        return env
+        return RecordedEpisode(env) if recorded else env
 
     makers: list[Callable[[], gym.Env]] = [partial(one, index) for index in range(settings.n_envs)]
     env: VecEnv

@@ -129,7 +129,7 @@ def open_run(options: TrainOptions) -> StoredRun:
 
     result = StoredRun(run, resumed, config, model_steps(run.model))
     if not result.finished and not run.checkpoints.is_dir():
-        raise ConfigError(f"--resume: '{folder}' has no checkpoints — it was started without --save-freq, or with subproc")
+        raise ConfigError(f"--resume: '{folder}' has no checkpoints — it was started without --save-freq")
     if not result.finished and resumed.save_freq <= 0:
         raise ConfigError(f"--save-freq: {resumed.save_freq} — expected a number > 0 for a run that is resumed")
     return result

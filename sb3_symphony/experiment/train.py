@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.plots import plot_training
-from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of, record_episodes
+from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of
 from sb3_symphony.experiment.agent import check_device
 from sb3_symphony.experiment.callbacks import (
     NoteLogFolder,
@@ -117,6 +117,7 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
         seed,
         options.vec_env == "subproc",
         options.gym_packages,
+        recorded=options.save_freq > 0,
     )
     try:
         check_spaces(env, options.env, options.algo, config.settings.policy)
@@ -146,11 +147,6 @@ def _evaluation(
         log_path=run.path,
         verbose=verbose,
     )
-
-
-def _resumable(options: TrainOptions) -> bool:
-    """Episodes in other processes cannot be recorded."""
-    return options.save_freq > 0 and options.vec_env == "dummy"
 
 
 def _saved_models(options: TrainOptions, config: RunConfig, run: RunFolder) -> CheckpointCallback:
@@ -183,7 +179,7 @@ def _callbacks(
     options: TrainOptions, config: RunConfig, run: RunFolder, evaluation_env: VecEnv | None, verbose: int
 ) -> tuple[StopOnSignal, SeededEvaluation | None, list[BaseCallback]]:
     """One that stops, one that evaluates if there is an environment for it, and all whose counts belong to the run."""
-    stop = StopOnSignal(at_rollouts=_resumable(options))
+    stop = StopOnSignal(at_rollouts=options.save_freq > 0)
     evaluation = None if evaluation_env is None else _evaluation(options, config, run, evaluation_env, stop, verbose)
     counting: list[BaseCallback] = [evaluation] if evaluation else []
     if options.save_freq > 0:
@@ -357,7 +353,7 @@ def _train(
     beginning = ""
     if run is None:
         run = RunFolder.create(options.log_folder, options.algo, options.env, folder)
-        if _resumable(options):
+        if options.save_freq > 0:
             run.checkpoints.mkdir()
             cleanup.enter_context(_alone(run))
         if options.seed < 0:
@@ -372,8 +368,7 @@ def _train(
     stop, evaluation, callbacks = _callbacks(options, config, run, evaluation_env, verbose)
     callbacks += own_callbacks
     checkpoints = None
-    if _resumable(options):
-        record_episodes(env)
+    if options.save_freq > 0:
         checkpoints = _checkpoints(options, run, callbacks, checkpoint, stop)
         callbacks.append(checkpoints)
     callbacks += [stop, NoteLogFolder(run.log_folder)]  # the checkpoint is made before
@@ -389,8 +384,6 @@ def _train(
     total = config.settings.n_timesteps
     if not options.quiet:
         print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
-        if options.save_freq > 0 and not _resumable(options):
-            print("note: --save-freq saves models only, as --resume needs --vec-env dummy", flush=True)
     with stop.listening(), _full_disk_told(run):
         try:
             model.learn(total, callback=callbacks, **learn_arguments)
