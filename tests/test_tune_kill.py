@@ -4,6 +4,7 @@ import csv
 import random
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 
 import optuna
@@ -89,6 +90,7 @@ def check(folder: Path, where: str, n_trials: int) -> None:
     finally:
         storage.close()
     print({state.name: sum(trial.state == state for trial in trials) for state in TrialState})
+    print(Counter(reason_of(trial) for trial in trials if trial.state == TrialState.FAIL))
     assert all(trial.state.is_finished() for trial in trials)
     chains: dict[int, list[optuna.trial.FrozenTrial]] = {}  # a trial and its repetitions
     for trial in trials:

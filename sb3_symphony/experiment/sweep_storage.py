@@ -371,8 +371,9 @@ class PostgresSweep:
 
     def close(self) -> None:
         """Close the connections."""
-        self._database.remove_session()
-        self._database.engine.dispose()
+        with suppress(SQLAlchemyError):  # where the server has gone, there is nothing to close
+            self._database.remove_session()
+            self._database.engine.dispose()
 
 
 def _address(url: str) -> sqlalchemy.URL:
