@@ -1,5 +1,6 @@
 """Shared fixtures: small, fast models of all three algorithms."""
 
+import signal
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -14,6 +15,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_symphony import REDQ, DroQ, Symphony
 
 th.set_num_threads(1)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # so inherited where a shell started the tests in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _pendulum(n_envs: int = 1, episode: int = 25, **kwargs: Any) -> VecEnv:

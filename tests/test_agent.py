@@ -359,10 +359,10 @@ def test_other_mistakes(folder):
 
 def test_packages_that_register_environments(folder, monkeypatch):
     register = "gymnasium.register('MyRobot-v0', 'gymnasium.envs.classic_control:PendulumEnv', max_episode_steps=7)"
-    (folder / "my_robot.py").write_text(f"import gymnasium\n\n{register}\n")
+    (folder / "agents_robot.py").write_text(f"import gymnasium\n\n{register}\n")
     monkeypatch.syspath_prepend(str(folder))
     saved("sac", "Pendulum-v1", policy_kwargs={"net_arch": [8]})
-    with open_agent(options("sac", "MyRobot-v0", gym_packages=["my_robot"])) as agent:
+    with open_agent(options("sac", "MyRobot-v0", gym_packages=["agents_robot"])) as agent:
         assert len(list(agent.episode(0))) == 7
     gym.registry.pop("MyRobot-v0")
 

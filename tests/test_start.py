@@ -220,12 +220,12 @@ def test_resumed_run_that_started_from_a_trained_agent(folder):
 
 
 def test_copies_in_processes(folder, monkeypatch):
-    (folder / "my_robot.py").write_text(OWN_ENV)
+    (folder / "my_robots.py").write_text(OWN_ENV.replace("Robot", "Robots"))
     monkeypatch.syspath_prepend(str(folder))
     small = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 64, "batch_size": 16, "n_envs": 2}
     runs = []
     for kind in ("dummy", "subproc"):
-        chosen = options("ppo", "Robot-v0", 256, hyperparams=small, vec_env=kind, gym_packages=["my_robot"], eval_freq=128)
+        chosen = options("ppo", "Robots-v0", 256, hyperparams=small, vec_env=kind, gym_packages=["my_robots"], eval_freq=128)
         runs.append(train(chosen).run)
     a, b = (PPO.load(run.model).policy.state_dict() for run in runs)
     assert same(a, b)
