@@ -261,6 +261,24 @@ def test_torso_mass(name):
     )
 
 
+@pytest.mark.filterwarnings("ignore:.*out of date.*:DeprecationWarning")
+def test_torso_mass_drawn_for_each_episode():
+    env = TorsoMass(hopper("Hopper-v4"), mass=(2.0, 10.0))
+    masses = []
+    for _ in range(200):
+        env.reset()
+        masses.append(env.mass)
+        assert float(env.unwrapped.model.body("torso").mass[0]) == env.mass
+    assert min(masses) < 2.5 and max(masses) > 9.5 and abs(np.mean(masses) - 6) < 0.6  # 3.7 standard errors
+    first = roll(env, 7)  # an episode depends on its seed alone
+    drawn = env.mass
+    roll(env, 8)
+    assert env.mass != drawn
+    np.testing.assert_array_equal(roll(env, 7), first)
+    assert env.mass == drawn
+    np.testing.assert_array_equal(roll(TorsoMass(hopper("Hopper-v4"), mass=drawn), 7), first)
+
+
 def test_torso_mass_refusals():
     with pytest.raises(TypeError, match="not a MuJoCo environment"):
         TorsoMass(gym.make("Pendulum-v1"), mass=3.0)
@@ -269,3 +287,6 @@ def test_torso_mass_refusals():
     for mass in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match=f"mass={mass!r}"):
             TorsoMass(gym.make("Pendulum-v1"), mass=mass)
+    for masses in ((5.0, 3.0), (1.0, 2.0, 3.0), (0.0, 3.0)):
+        with pytest.raises(ValueError, match="mass="):
+            TorsoMass(hopper("Hopper-v4"), mass=masses)

@@ -293,26 +293,49 @@ class TorsoMass(gym.Wrapper):
     """
     Changes the mass of the body ``torso`` of a MuJoCo environment (Hopper, Walker2d, HalfCheetah, Ant, …).
 
-    The mass holds from the first reset on, over all episodes. Only the mass changes, not the inertia; the constants
-    that MuJoCo derives from masses when it compiles a model are computed anew.
+    A fixed mass holds from the first reset on, over all episodes; with two masses, each episode draws its own between
+    them (domain randomisation), which depends on the seed of the reset if there is one. Only the mass changes, not the
+    inertia; the constants that MuJoCo derives from masses when it compiles a model are computed anew.
 
     :param env: MuJoCo environment, such as Hopper-v4 or Hopper-v5
-    :param mass: new mass in kg, > 0 (Hopper's own: 3.665)
+    :param mass: new mass in kg, > 0 (Hopper's own: 3.665); or the lowest and the highest one
     :raises TypeError: if the environment is not a MuJoCo one or has no body named ``torso``
-    :raises ValueError: if the mass is not finite and > 0
+    :raises ValueError: if a mass is not finite and > 0, or the lowest is not below the highest
     """
 
-    def __init__(self, env: gym.Env, mass: float) -> None:
-        check_number("mass", mass, 0, exclusive=True)  # kg
+    def __init__(self, env: gym.Env, mass: float | tuple[float, float]) -> None:
+        self.masses = tuple(mass) if isinstance(mass, list | tuple) else (mass,)
+        for each in self.masses:
+            check_number("mass", each, 0, exclusive=True)  # kg
+        if len(self.masses) not in (1, 2) or (len(self.masses) == 2 and not self.masses[0] < self.masses[1]):
+            raise ValueError(f"mass={mass!r}: expected a number, or the lowest and the highest mass")
         model: Any = getattr(env.unwrapped, "model", None)
         if not hasattr(model, "body_mass"):
             raise TypeError(f"TorsoMass: {env} is not a MuJoCo environment")
         import mujoco
 
-        body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "torso")
-        if body < 0:
+        self.body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "torso")
+        if self.body < 0:
             raise TypeError(f"TorsoMass: {env} has no body named 'torso'")
         super().__init__(env)
+        self._set(self.masses[0])
+
+    def _set(self, mass: float) -> None:
+        import mujoco
+
         self.mass = float(mass)
-        model.body_mass[body] = self.mass
+        model: Any = self.env.unwrapped.model  # type: ignore[attr-defined]  # a MuJoCo environment
+        model.body_mass[self.body] = self.mass
         mujoco.mj_setConst(model, mujoco.MjData(model))  # on scratch data: it overwrites the state
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: seed of the episode, or None to go on with the environment's generator
+        :param options: handed to the environment
+        :return: first observation and info
+        """
+        if len(self.masses) == 2:
+            # Before the reset, which computes with the mass; a stream of its own, or it would go with the first observation
+            generator = self.np_random if seed is None else np.random.default_rng([seed, self.body])
+            self._set(generator.uniform(*self.masses))
+        return self.env.reset(seed=seed, options=options)
