@@ -225,6 +225,7 @@ def _add_selection(parser: argparse.ArgumentParser, several: bool = False) -> No
     add("--load-last-checkpoint", action="store_true", help="model saved latest, of a run that did not end")
     add("--vecnormalize", metavar="PKL", help="statistics of VecNormalize, or none (default: the run's)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
+    add("--env-wrapper", nargs="+", metavar="W:{K: V}", help="wrappers of the environment, or other arguments for the run's")
     add("--gym-packages", nargs="+", metavar="M", help="modules to import, which register environments")
     add("--device", help="auto, cpu or cuda (default: auto)")
     add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch")
@@ -239,8 +240,9 @@ def _add_deterministic(parser: argparse.ArgumentParser) -> None:
 
 def _selection(model: type[SelectOptions], arguments: dict[str, Any]) -> Any:
     """The options of a command on a trained agent."""
-    if "env_kwargs" in arguments:
-        arguments["env_kwargs"] = parse_pairs(arguments["env_kwargs"], "--env-kwargs")
+    for name, flag in (("env_kwargs", "--env-kwargs"), ("env_wrapper", "--env-wrapper")):
+        if name in arguments:
+            arguments[name] = parse_pairs(arguments[name], flag)
     return validated(model, arguments)
 
 

@@ -198,3 +198,12 @@ def test_damaged_run_folder(folder, name, content, message):
     (run / "Pendulum-v1" / name).write_text(content)
     fails(message, algo="sac", env="Pendulum-v1")
     assert not (folder / "owned").exists()
+
+
+def test_wrappers_over_those_of_the_run(folder):
+    one, two = "gymnasium.wrappers.TimeLimit", "gymnasium.wrappers.RescaleAction"
+    run = make_run(folder / "logs", config={"env_wrapper": [{one: {"max_episode_steps": 5}}, two]})
+    run = str(run)
+    assert select(model=run).settings.env_wrapper == [(one, {"max_episode_steps": 5}), (two, {})]
+    changed = select(model=run, env_wrapper={"a.B": {"c": 1}, one: {"max_episode_steps": 9}})
+    assert changed.settings.env_wrapper == [(one, {"max_episode_steps": 9}), (two, {}), ("a.B", {"c": 1})]

@@ -236,6 +236,10 @@ def _named_list(value: Any) -> Any:
     return items
 
 
+#: wrappers or callbacks with their arguments
+NamedList = Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)]
+
+
 def _no_boolean(value: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError("expected a whole number")
@@ -269,9 +273,9 @@ class RunSettings(BaseModel):
     policy: str = "MlpPolicy"
     n_envs: _Count = 1
     normalize: bool | dict[str, Any] = False
-    env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
-    vec_env_wrapper: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
-    callback: Annotated[list[tuple[str, dict[str, Any]]], BeforeValidator(_named_list)] = []
+    env_wrapper: NamedList = []
+    vec_env_wrapper: NamedList = []
+    callback: NamedList = []
     env_kwargs: dict[str, Any] = {}
     frame_stack: _Count | None = None
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None

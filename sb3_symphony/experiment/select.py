@@ -12,7 +12,15 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from sb3_symphony.common.checks import suggestion
-from sb3_symphony.experiment.config import ConfigError, RunSettings, check_algorithm, read_yaml, run_settings, shipped_folder
+from sb3_symphony.experiment.config import (
+    ConfigError,
+    NamedList,
+    RunSettings,
+    check_algorithm,
+    read_yaml,
+    run_settings,
+    shipped_folder,
+)
 from sb3_symphony.experiment.registry import LOADABLE
 from sb3_symphony.experiment.run_folder import RunFolder
 
@@ -33,6 +41,7 @@ class SelectOptions(BaseModel):
     :param load_last_checkpoint: the latest saved model of a run that did not end
     :param vecnormalize: statistics of ``VecNormalize`` to use instead of the run's; ``none``: no normalisation
     :param env_kwargs: arguments of the environment, over those of the run
+    :param env_wrapper: wrappers of the environment: instead of those of the same names in the run, else around them
     :param gym_packages: modules to import, which register environments
     :param device: where the networks run
     :param num_threads: threads of PyTorch, -1: its own choice
@@ -50,6 +59,7 @@ class SelectOptions(BaseModel):
     load_last_checkpoint: bool = False
     vecnormalize: str | None = None
     env_kwargs: dict[str, Any] = {}
+    env_wrapper: NamedList = []
     gym_packages: list[str] = []
     device: str = "auto"
     num_threads: int = -1
@@ -162,6 +172,9 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
     if env_id != trained.get("env", env_id):
         env_kwargs = {}  # of another environment
     settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": {**env_kwargs, **options.env_kwargs}})
+    given = dict(options.env_wrapper)
+    wrappers = [(name, given.pop(name, arguments)) for name, arguments in settings.env_wrapper]
+    settings = settings.model_copy(update={"env_wrapper": [*wrappers, *given.items()]})
     normalization = _normalization(options, model, run, settings)
     known = run is not None or options.vecnormalize is not None
     return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None, known)
