@@ -568,6 +568,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: exit status: 0, 2 for a mistake in the input, 130 after an interruption
     """
     argv = sys.argv[1:] if argv is None else list(argv)
+    if "" not in sys.path:
+        sys.path.append("")  # one's own robot.py in the working folder is found, as by `python -m`
     namespace, unknown = make_parser().parse_known_args(argv)
     arguments = vars(namespace)
     command, run, parser = (arguments.pop(name) for name in ("command", "run", "parser"))
