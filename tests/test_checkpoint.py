@@ -258,14 +258,15 @@ class GlobalRandomEnv(gym.Env):
         return self._draw("observation"), reward, bool(ends), False, {}
 
 
-@pytest.mark.parametrize("where", ["observation", "reward"])
-def test_what_cannot_be_replayed_is_noticed(tmp_path, where):
+@pytest.mark.parametrize("where, moves", [("observation", 0), ("reward", 1)])
+def test_what_cannot_be_replayed_is_noticed(tmp_path, where, moves):
+    """At once: a robot must not repeat moves that were made for another situation."""
     env = RecordedEpisode(Monitor(GlobalRandomEnv(where), str(tmp_path / "0")))
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(3))
     assert not env.replay(env.recorded_state())
-    assert env.monitor.results_writer is not None
+    assert env.monitor.results_writer is not None and env.unwrapped.n == moves
 
 
 def test_an_episode_that_ends_in_its_replay_is_noticed(tmp_path):

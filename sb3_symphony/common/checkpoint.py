@@ -25,6 +25,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -366,6 +367,7 @@ class RecordedEpisode(gym.Wrapper):
         self.start = {"generators": generators, "seed": seed, "options": options, "wrappers": self._wrappers()}
         self.actions = []
         self.observation, info = self.env.reset(seed=seed, options=options)
+        self.start["observation"] = deepcopy(self.observation)  # some environments write the next one into it
         return self.observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -392,26 +394,29 @@ class RecordedEpisode(gym.Wrapper):
 
     def replay(self, state: dict[str, Any]) -> bool:
         """
-        Begin the recorded episode again and replay its actions.
+        Begin the recorded episode again and replay its actions, as long as they lead to what they led to: a robot does not
+        repeat moves that were made for another situation.
 
         :param state: from :meth:`recorded_state`
         :return: whether that reproduced observation and rewards bit for bit
         """
-        start, writer = state["start"], self.monitor.results_writer
+        start, rewards, writer = state["start"], state["monitor"]["rewards"], self.monitor.results_writer
         self.monitor.results_writer = None  # an episode that ends here never happened
         try:
             self._set_wrappers(start["wrappers"])
             self._set_generators(start["generators"])
             self.reset(seed=start["seed"], options=start["options"])
-            for action in state["actions"]:
+            first = start.get("observation", self.observation)  # files of earlier versions have none
+            if not _same_bits(self.observation, first):
+                return False
+            for action, reward in zip(state["actions"], rewards, strict=True):
                 _, _, terminated, truncated, _ = self.step(action)
-                if terminated or truncated:
+                if terminated or truncated or self.monitor.rewards[-1] != reward:
                     return False
-            rewards = self.monitor.rewards
         finally:
             self.monitor.results_writer = writer
             self._set_monitor(state)
-        return _same_bits(self.observation, state["observation"]) and rewards == state["monitor"]["rewards"]
+        return _same_bits(self.observation, state["observation"])
 
     def start_anew(self, state: dict[str, Any]) -> None:
         """
