@@ -388,6 +388,29 @@ def test_show(played, options, tmp_path, capsys):
     assert len(played.started) == 5
 
 
+def test_trials_that_run_are_shown(played, options):
+    tune(options())
+    storage = open_storage(options().where, lambda: None, 1)
+    study = optuna.load_study(study_name="ppo-Line-v0", storage=storage.optuna)
+    study.ask()  # has not been evaluated yet
+    running = study.ask()
+    running.report(-1.0, 1)
+    running.report(1.25, 2)
+    storage.close()
+    lines = tune(options(show=True)).summary.splitlines()
+    assert lines[:2] == ["ppo-Line-v0: 7 trials (5 completed, 2 running)", "  trial 6: 1.25 at evaluation 2 of 3"]
+    assert lines[2].split()[:2] == ["trial", "value"] and len(lines) == 2 + 1 + 5 + 1
+
+
+def test_a_line_tells_what_a_trial_begins_with(played, options, capsys):
+    tune(options(n_trials=1))
+    (trial,) = trials_of(options())
+    gamma, rate, epochs = (trial.params[name] for name in ("gamma", "learning_rate", "n_epochs"))
+    line = f"begins: trial 0 | gamma {gamma}, learning_rate {rate:.4g}, n_epochs {epochs}, policy_kwargs.net_arch"
+    out = capsys.readouterr().out
+    assert line in out and out.index(line) < out.index("trial 0 3.5")
+
+
 def test_summary_before_anything_has_completed(played, options):
     played.script = staticmethod(lambda config: TrialFailed("seed 100: environment: gone", "failed"))
     result = tune(options(n_trials=2))

@@ -1,6 +1,7 @@
-"""The cells of a grid while they run: a live table in a terminal, else a line for each change."""
+"""The cells of a grid while they run: a live table in a terminal, elsewhere lines that a log file can take."""
 
 import sys
+import time
 from collections import Counter
 from collections.abc import Sequence
 from types import TracebackType
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
 
 _COLUMNS = ("cell", "state", "step", "return", "time left")
 _STYLES = {"running": "bold", "failed": "red", "queued": "dim", "stopped": "yellow", "done": "green"}
+_STOPPING = "saving and stopping (Ctrl-C again: at once)"
+#: without a terminal, how far a cell is is told after this share of its steps, and so many seconds, at least
+_SHARE, _SECONDS = 0.1, 60.0
 
 
 def _time(seconds: float | None) -> str:
@@ -63,7 +67,9 @@ class View:
         self.progress = progress
         self.console = Console(file=sys.stdout)
         self.live = Live(console=self.console, auto_refresh=False) if self.console.is_terminal else None
-        self.told = {each.cell.name: "done" if each.kept else "queued" for each in progress}
+        # What was told of each cell, and when
+        self.told = {each.cell.name: ("done" if each.kept else "queued", each.steps, 0.0) for each in progress}
+        self.stopping = False
 
     def __enter__(self) -> "View":
         if self.live is not None:
@@ -81,12 +87,21 @@ class View:
         if self.live is not None:
             self.live.update(self._table(stopping), refresh=True)
             return
+        if stopping and not self.stopping:
+            self.stopping = True
+            print(_STOPPING, flush=True)
+        now = time.monotonic()
         for each in self.progress:
-            if self.told[each.cell.name] != each.state:
-                self.told[each.cell.name] = each.state
-                name, state, steps, latest, reason = _cells(each)
-                parts = [f"{state} {name}", f"step {steps}", *([f"return {latest}"] if latest else [])]
-                print(" | ".join([*parts, *([reason] if each.state == "failed" else [])]), flush=True)
+            state, steps, moment = self.told[each.cell.name]
+            if each.state != state or (each.steps >= steps + _SHARE * each.total and now >= moment + _SECONDS):
+                self.told[each.cell.name] = (each.state, each.steps, now)
+                print(self._line(each), flush=True)
+
+    def _line(self, each: "Progress") -> str:
+        name, state, steps, latest, note = _cells(each)
+        parts = [f"{state} {name}", f"step {steps}", *([f"return {latest}"] if latest else [])]
+        parts += [note if each.state == "failed" else f"{note} left"] if note else []
+        return " | ".join([*parts, _counts(self.progress) + self._left()])
 
     def _table(self, stopping: bool) -> Table:
         """Those that run first; as many of the others as there is room for."""
@@ -94,7 +109,7 @@ class View:
         shown = sorted(self.progress, key=lambda each: order.index(each.state))
         room = max(self.console.height - 7, 5)
         caption = _counts(self.progress) + self._left()
-        caption += " — saving and stopping (Ctrl-C again: at once)" if stopping else ""
+        caption += f" — {_STOPPING}" if stopping else ""
         table = Table(caption=caption, caption_justify="left")
         for name, justify in zip(_COLUMNS, ("left", "left", "right", "right", "left"), strict=True):
             options: Any = {"justify": justify, "no_wrap": name != "time left", "overflow": "ellipsis"}

@@ -59,6 +59,14 @@ def best_of(trials: list[FrozenTrial]) -> FrozenTrial | None:
     return next(iter(ranked(trials)), None)
 
 
+def parameters_of(trial: FrozenTrial | optuna.Trial) -> dict[str, str]:
+    """
+    :param trial: a trial
+    :return: its parameters, short enough for the terminal
+    """
+    return {k: f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in trial.params.items()}
+
+
 class SweepReport:
     """
     Results of a study, as they are at the moment of each call.
@@ -176,12 +184,16 @@ class SweepReport:
         lines[0] = lines[0] if again else lines[0].replace("; 0 of them tried again", "")
         reasons = Counter(reason_of(trial) for trial in trials if trial.state == TrialState.FAIL)
         lines += [f"  failed {count} ×: {reason}" for reason, count in reasons.most_common(5)]
+        for trial in trials:
+            if trial.state == TrialState.RUNNING and trial.last_step is not None:
+                latest, step = trial.intermediate_values[trial.last_step], trial.last_step
+                lines.append(f"  trial {trial.number}: {latest:.2f} at evaluation {step} of {self.plan['n_evaluations']}")
         best = ranked(trials)
         if not best:
             return "\n".join([*lines, "no trial has completed yet"])
         names = list(best[0].params)
         table = [["trial", "value", *names]]
-        table += [[str(t.number), f"{t.value:.2f}", *(_short(t.params.get(name)) for name in names)] for t in best[:5]]
+        table += [[str(t.number), f"{t.value:.2f}", *map(parameters_of(t).__getitem__, names)] for t in best[:5]]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
         return "\n".join([*lines, f"best: trial {best[0].number}, {best[0].value:.2f} | {self.folder / 'best.yml'}"])
@@ -189,7 +201,3 @@ class SweepReport:
 
 def _cell(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, list | dict) else value
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

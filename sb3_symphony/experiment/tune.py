@@ -30,7 +30,7 @@ from sb3_symphony.experiment.callbacks import StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, check_algorithm, load_config, merge
 from sb3_symphony.experiment.output import output_folder
 from sb3_symphony.experiment.space import SearchSpace, TuneOptions, read_space
-from sb3_symphony.experiment.sweep_report import ENDED, PLAN, REASON, RETURNS, SweepReport, best_of, replaced
+from sb3_symphony.experiment.sweep_report import ENDED, PLAN, REASON, RETURNS, SweepReport, best_of, parameters_of, replaced
 from sb3_symphony.experiment.sweep_storage import WORKER, StorageAway, SweepStorage, open_storage
 from sb3_symphony.experiment.train import build_model
 from sb3_symphony.experiment.trial import TrialFailed, TrialProcesses, evaluation_frequency, ignore_mini_batches
@@ -308,6 +308,8 @@ class Sweep:
             self._tell(study, trial, TrialState.FAIL, {REASON: failure.reason, ENDED: failure.kind})
         else:
             self._running.append(_Running(study, trial, processes))
+            drawn = ", ".join(f"{name} {value}" for name, value in parameters_of(trial).items())
+            print(f"begins: trial {number} | {drawn}", flush=True)
         return True
 
     # Following --------------------------------------------------------------------------------------------------------
