@@ -504,6 +504,7 @@ def _add_bench(commands: Any) -> None:
     add("-j", "--n-jobs", type=_whole_number, metavar="N", help="cells at a time (default: one for each core)")
     add("--backend", choices=("loky", "ray"), help="loky: this machine; ray: a cluster (default: loky)")
     add("--address", metavar="A", help="Ray cluster, HOST:PORT or auto (default: one is started on this machine)")
+    add("-a", "--algo", nargs="+", metavar="NAME", help="only these algorithms of the study (default: all)")
     add("-f", "--folder", metavar="DIR", help="where results are kept (default: logs/bench/<study>)")
     add("--report", action="store_true", help="only write tables and figures")
     add("--dry-run", action="store_true", help="only show the cells and how far they are")

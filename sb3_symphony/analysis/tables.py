@@ -45,7 +45,9 @@ class Result:
     :param seed: seed
     :param thresholds: what counts as success
     :param run: its files; None if there are none yet
-    :param summary: ``steps``, ``updates``, ``seconds`` and, if it was asked for, ``final``; None as long as it is not done
+    :param summary: ``steps``, ``updates``, ``seconds`` and, if it was asked for, ``final`` and ``conditions``; None as long as
+        it is not done
+    :param reported: what others have reported of the variant
     """
 
     algorithm: str
@@ -54,6 +56,7 @@ class Result:
     thresholds: Thresholds
     run: Run | None
     summary: dict[str, Any] | None
+    reported: str = ""
 
     @cached_property
     def events(self) -> RunEvents:
@@ -116,7 +119,7 @@ def episode_rows(results: Iterable[Result]) -> Iterator[Row]:
     """
     :param results: runs
     :return: a row for each episode: of training (``step`` is that of its end), of an evaluation in its course (``step`` is
-        that of the training), and of the evaluation at the end
+        that of the training), and of the evaluations at the end
     """
 
     def rows(result: Result, kind: str, steps: Any, seeds: Any, returns: Any, lengths: Any, successes: Any) -> Iterator[Row]:
@@ -143,6 +146,10 @@ def episode_rows(results: Iterable[Result]) -> Iterator[Row]:
             assert result.summary is not None
             seeds, steps = range(final["seed"], final["seed"] + n), [result.summary["steps"]] * n
             yield from rows(result, "final", steps, seeds, final["returns"], final["lengths"], final["successes"])
+        for name, each in (result.summary or {}).get("conditions", {}).items():
+            n = len(each["returns"])
+            seeds, steps = range(each["seed"], each["seed"] + n), [result.summary["steps"]] * n  # type: ignore[index]
+            yield from rows(result, f"condition {name}", steps, seeds, each["returns"], each["lengths"], each["successes"])
 
 
 def _event(name: str, event: Event | None) -> Row:
@@ -280,8 +287,11 @@ def _summary(result: Result) -> dict[str, Any]:
     return result.summary
 
 
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """A Markdown table that is readable as text too: names to the left, numbers to the right."""
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """
+    :param rows: names of the columns, then the cells of each row
+    :return: lines of a Markdown table that is readable as text too: names to the left, numbers to the right
+    """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         f"| {row[0]:{widths[0]}} | "
@@ -299,16 +309,18 @@ def markdown_table(results: Sequence[Result]) -> str:
     :return: heading, table and what its columns mean
     """
     columns = _columns(results)
-    rows = [["algorithm", "seeds", "steps", *(name for name, _ in columns)]]
+    told = any(each.reported for each in results)
+    rows = [["algorithm", "seeds", "steps", *(name for name, _ in columns), *["reported"] * told]]
     for algorithm in dict.fromkeys(each.algorithm for each in results):
         own = [each for each in results if each.algorithm == algorithm]
         done = [each for each in own if each.summary is not None]
         mark = "" if all(each.standard for each in own if each.run) else " (non-standard)"
         seeds = f"{len(done)}" if len(done) == len(own) else f"{len(done)} of {len(own)}"
         steps = " or ".join(_number(n) for n in sorted({_summary(each)["steps"] for each in done})) or _NOTHING
-        rows.append([algorithm + mark, seeds, steps, *(write(done) if done else _NOTHING for _, write in columns)])
+        cells = [write(done) if done else _NOTHING for _, write in columns]
+        rows.append([algorithm + mark, seeds, steps, *cells, *[own[0].reported or _NOTHING] * told])
     names = [name for name, _ in columns]
-    return "\n".join([f"### {results[0].environment}", "", *_aligned(rows), "", *_meaning(results, names), ""])
+    return "\n".join([f"### {results[0].environment}", "", *aligned(rows), "", *_meaning(results, names), ""])
 
 
 def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:

@@ -75,6 +75,7 @@ class Job:
     :param options: options of ``train``, of a run that begins
     :param run: its run folder
     :param final_episodes: episodes to evaluate the model on at the end
+    :param conditions: name → options of ``evaluate`` that differ when it is evaluated on as many episodes once more
     :param session: folder of this execution of the grid, with ``control.json``
     """
 
@@ -82,6 +83,7 @@ class Job:
     options: dict[str, Any]
     run: str
     final_episodes: int
+    conditions: dict[str, dict[str, Any]]
     session: str
 
     @property
@@ -231,10 +233,13 @@ def _command(options: TrainOptions) -> str:
         "--verbose": options.verbose,
         "--protocol": options.protocol,
         "--threshold": options.threshold,
+        "-i": options.trained_agent,
+        "-tb": options.tensorboard_log or None,
     }
     if options.protocol is None:
         flags |= {"--eval-freq": options.eval_freq, "--eval-episodes": options.eval_episodes}
-    return "sb3-symphony train " + " ".join(f"{k} {shlex.quote(str(v))}" for k, v in flags.items() if v is not None)
+    words = [f"{flag} {shlex.quote(str(value))}" for flag, value in flags.items() if value is not None]
+    return " ".join(["sb3-symphony train", *words, *["--with-replay-buffer"] * options.with_replay_buffer])
 
 
 def run_cell(job: Job) -> bool:
@@ -265,7 +270,8 @@ def run_cell(job: Job) -> bool:
         "updates": _updates(run.model),
         "seconds": round(_seconds(run) if result.untouched else result.seconds, 3),
         "machine": _machine(),
-        **({"final": _final(job, options)} if job.final_episodes else {}),
+        **({"final": _evaluated(job, {})} if job.final_episodes else {}),
+        **({"conditions": _under_conditions(job)} if job.conditions else {}),
     }
     write_atomically(result_file(run.path), (json.dumps(content, indent=1) + "\n").encode())
     return True
@@ -300,11 +306,16 @@ def _machine() -> dict[str, Any]:
     }
 
 
-def _final(job: Job, options: TrainOptions) -> dict[str, Any]:
+def _under_conditions(job: Job) -> dict[str, Any]:
+    return {name: _evaluated(job, different) for name, different in job.conditions.items()}
+
+
+def _evaluated(job: Job, different: dict[str, Any]) -> dict[str, Any]:
     from sb3_symphony.experiment.evaluate import evaluate
     from sb3_symphony.experiment.select import EvaluateOptions
 
-    result = evaluate(EvaluateOptions(model=job.run, n_episodes=job.final_episodes, device=options.device))
+    settled = {"model": job.run, "algo": job.options["algo"], "device": job.options["device"]}
+    result = evaluate(EvaluateOptions.model_validate({**settled, "n_episodes": job.final_episodes, **different}))
     return {
         "seed": result.options.seed,
         "returns": [episode.reward for episode in result.episodes],

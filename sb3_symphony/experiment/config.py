@@ -19,7 +19,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
 from sb3_symphony.common.checks import suggestion
-from sb3_symphony.experiment.registry import ALGORITHMS
+from sb3_symphony.experiment.registry import ALGORITHMS, is_file
 
 
 class ConfigError(ValueError):
@@ -160,6 +160,15 @@ def shipped_folder(name: str = "hyperparams") -> Path:
     return installed if installed.is_dir() else package.parent / name
 
 
+def shipped_file(name: str) -> Path | None:
+    """
+    :param name: name of a preset, or of an algorithm
+    :return: its shipped YAML file, None if there is none
+    """
+    places = (shipped_folder() / "presets" / f"{name}.yml", shipped_folder() / f"{name}.yml")
+    return next((path for path in places if path.is_file()), None)
+
+
 def shipped_environments(algo: str) -> list[str]:
     """
     :param algo: name of an algorithm
@@ -231,6 +240,8 @@ def _named_list(value: Any) -> Any:
             items.append((item, {}))
         elif isinstance(item, dict) and all(isinstance(v, dict | None) for v in item.values()):
             items += [(name, arguments or {}) for name, arguments in item.items()]
+        elif isinstance(item, list | tuple) and [type(part) for part in item] == [str, dict]:  # as this function returns it
+            items.append((item[0], item[1]))
         else:
             raise ValueError("expected a dotted name, {name: {argument: value}}, or a list of these")
     return items
@@ -331,7 +342,11 @@ def check_algorithm(name: str, known: Iterable[str] = ALGORITHMS) -> None:
     :param known: those that can be meant, by default those that can be trained
     :raises ConfigError: if there is none of that name
     """
-    if name not in known:
+    if is_file(name):
+        path = Path(name.rpartition(":")[0])
+        if not path.is_file():
+            raise ConfigError(f"unknown algorithm '{name}' — there is no file {path}")
+    elif name not in known:
         near = suggestion(name, known) or f" — expected one of {', '.join(known)}"
         raise ConfigError(f"unknown algorithm '{name}'{near}")
 
@@ -345,9 +360,10 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
     :raises ConfigError: if there is none, or the file cannot be read
     """
     path = Path(shipped_folder() / f"{options.algo}.yml" if options.conf_file is None else options.conf_file)
-    preset = shipped_folder() / "presets" / f"{path}.yml"
-    if preset.is_file() and not path.exists():
-        path = preset
+    if options.conf_file is None and is_file(options.algo):
+        raise ConfigError(f"--conf-file: missing — expected settings for {options.algo}, such as the name of its parent, redq")
+    if not path.exists():
+        path = shipped_file(str(path)) or path
     content = read_yaml(path)
     for name in (options.env, "default"):
         if name in content:
@@ -406,6 +422,18 @@ def load_config(options: TrainOptions, inherited: Mapping[str, Any] | None = Non
     check_algorithm(options.algo)
     _, entry = find_entry(options)
     return merge({**entry, **(inherited or {})}, options)
+
+
+#: what settles the networks of an agent and what they are given
+_NETWORKS = ("policy", "policy_kwargs", "n_critics", "use_sde", "normalize", "frame_stack")
+
+
+def of_networks(config: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param config: configuration of a run
+    :return: those of its keys that its networks depend on, which an agent that starts from them has to share
+    """
+    return {key: config.get(key) for key in _NETWORKS if config.get(key) is not None or key in ("normalize", "frame_stack")}
 
 
 def merge(entry: dict[str, Any], options: TrainOptions) -> RunConfig:

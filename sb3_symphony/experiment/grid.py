@@ -4,12 +4,14 @@
 Results lie in one folder, which holds all that is needed to go on or to make the tables anew::
 
     <folder>/study.yml                       the study
-    <folder>/settings/<algorithm>_<env>.yml  merged hyper-parameters of each variant
+    <folder>/settings/<algorithm>_<env>.yml  merged hyper-parameters of each variant, and files of its own algorithms
+    <folder>/sweeps/<algo>/tune/<name>/      what a search has found
     <folder>/<algorithm>/<env>_<seed>/       run folder of a cell, with result.json once it is done
     <folder>/<algorithm>/<env>_<seed>.log    what its process printed
-    <folder>/cells.csv, episodes.csv, table.md, evaluations.png, training.png
+    <folder>/cells.csv, episodes.csv, matrix.csv, table.md, evaluations.png, training.png, matrix.png, …
 """
 
+import os
 import shutil
 import threading
 import time
@@ -25,9 +27,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sb3_symphony.experiment.cell import Control, Job, Outcome, begun, read_result, supervise
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, parse_yaml, read_yaml
+from sb3_symphony.experiment.registry import is_file, without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.signals import handled_by
-from sb3_symphony.experiment.study import Cell, Environment, cells_of, configuration, read_study
+from sb3_symphony.experiment.study import Cell, Environment, Study, cells_of, configuration, read_study, sweep_options
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.tables import Result
@@ -48,6 +51,7 @@ class BenchOptions(BaseModel):
     backend: Literal["loky", "ray"] = "loky"
     n_jobs: int | None = Field(default=None, ge=1)
     address: str | None = None
+    algo: list[str] = []
     report: bool = False
     dry_run: bool = False
 
@@ -69,6 +73,7 @@ class Progress:
     :param steps: environment steps at the end of its latest training episode
     :param latest: mean return of the latest ten training episodes, None before the first
     :param since: moment and steps when it was first seen running
+    :param reported: what others have reported of it
     """
 
     cell: Cell
@@ -80,6 +85,7 @@ class Progress:
     steps: int = 0
     latest: float | None = None
     since: tuple[float, int] | None = None
+    reported: str = ""
 
     @property
     def total(self) -> int:
@@ -149,10 +155,11 @@ def bench(options: BenchOptions) -> BenchResult:
     if options.address is not None and options.backend != "ray":
         raise ConfigError(f"--address: '{options.address}' — is for --backend ray")
     path = Path(options.study)
-    study = read_study(path, options.quick)
+    study = read_study(path, options.quick, options.algo)
     name = path.absolute().parent.name if path.stem == "study" else path.stem
+    study = study.model_copy(update={"title": study.title or name})
     folder = Path(options.folder or f"logs/bench/{name}{'_quick' if options.quick else ''}").absolute()
-    progress = [_standing(cell, folder) for cell in cells_of(study, path.absolute().parent)]
+    progress = _standings(study, path, folder)
     if options.dry_run:
         from sb3_symphony.experiment.grid_view import plain_table
 
@@ -160,8 +167,8 @@ def bench(options: BenchOptions) -> BenchResult:
     if options.report:
         if not any(each.run.path.is_dir() for each in progress):
             raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
-        return BenchResult(folder, report(study.title or name, progress, folder))
-    return _run(options, study.title or name, progress, folder, path)
+        return BenchResult(folder, report(study, progress, folder))
+    return _run(options, study, progress, folder, path)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -172,20 +179,35 @@ def bench(options: BenchOptions) -> BenchResult:
 _DECISIVE = ("algo", "env", "seed", "eval_freq", "eval_episodes", "protocol", "threshold", "device")
 
 
+def _standings(study: Study, path: Path, folder: Path) -> list[Progress]:
+    progress = [_standing(cell, folder) for cell in cells_of(study, path.absolute().parent, folder)]
+    reported = {each.name: each.reported for each in study.algorithms}
+    for each in progress:
+        each.reported = reported[each.cell.algorithm]
+    return progress
+
+
 def _standing(cell: Cell, folder: Path) -> Progress:
     """How far a cell is; what is there has to be of the same settings."""
     config = configuration(cell)
     run = RunFolder(folder / cell.name, RunFolder.file_name(cell.environment.id))
     progress = Progress(cell, config, run)
-    if not begun(run):
+    if cell.waits:
+        assert cell.sweep is not None
+        progress.reason = f"waits for the search '{cell.sweep.parent.name}'"
+    if cell.waits or not begun(run):
         return progress
     _check_same(progress)
     progress.look()
     result = read_result(run.path)
-    done = result is not None and result["n_timesteps"] == progress.total
-    if done and len(result.get("final", {}).get("returns", [])) >= cell.final_episodes:  # type: ignore[union-attr]
+    if result is not None and result["n_timesteps"] == progress.total and _is_evaluated(result, cell):
         progress.state, progress.kept, progress.steps = "done", True, progress.total
     return progress
+
+
+def _is_evaluated(result: dict[str, Any], cell: Cell) -> bool:
+    evaluations = [result.get("final", {}), *(result.get("conditions", {}).get(name, {}) for name in cell.conditions)]
+    return all(len(each.get("returns", [])) >= cell.final_episodes for each in evaluations)
 
 
 def _check_same(progress: Progress) -> None:
@@ -197,7 +219,10 @@ def _check_same(progress: Progress) -> None:
         for name in ("eval_freq", "eval_episodes", *(["threshold"] if cell.options.threshold is None else [])):
             del options[name]
     config = parse_yaml(yaml.safe_dump(progress.config.plain), "study")
-    pairs = [(name, stored["options"].get(name), value) for name, value in options.items()]
+    pairs = [(name, stored["options"].get(name), value) for name, value in options.items() if name != "algo"]
+    pairs.append(("algo", without_folder(str(stored["options"].get("algo"))), without_folder(cell.options.algo)))
+    source = cell.start_from.name if cell.start_from else None
+    pairs.append(("start_from", _place(stored["options"].get("trained_agent")), source))
     pairs += [(name, stored["config"].get(name), config.get(name)) for name in dict.fromkeys([*stored["config"], *config])]
     for name, there, wanted in pairs:
         if name == "n_timesteps":
@@ -209,6 +234,11 @@ def _check_same(progress: Progress) -> None:
             raise ConfigError(
                 f"{cell.name}: was trained with {name} {there!r}, the study has {wanted!r} — expected the same, or another -f"
             )
+
+
+def _place(run: str | None) -> str | None:
+    """A run folder, without the folder of all results, which may have moved."""
+    return run and "/".join(Path(run).parts[-2:])
 
 
 def _check_models(progress: Sequence[Progress]) -> None:
@@ -238,22 +268,33 @@ def _write_settings(progress: Sequence[Progress], folder: Path, study: Path) -> 
         path = _settings_file(each, folder)
         if not path.is_file() or path.read_text(encoding="utf-8") != content:
             path.write_text(content, encoding="utf-8")
+        file, _, _ = each.cell.options.algo.rpartition(":")
+        if file:
+            shutil.copy(file, settings)
 
 
 def _settings_file(progress: Progress, folder: Path) -> Path:
     return folder / "settings" / f"{progress.cell.algorithm}_{progress.run.env_name}.yml"
 
 
-def _job(progress: Progress, folder: Path, session: Path) -> Job:
+def _job(progress: Progress, folder: Path, session: Path, tensorboard: bool) -> Job:
     """All settings come from one file, whose content was merged and checked here."""
-    merged = {"conf_file": str(_settings_file(progress, folder)), "hyperparams": {}, "env_kwargs": {}}
-    given = progress.cell.options.model_dump(include=progress.cell.options.model_fields_set)
+    cell = progress.cell
+    merged: dict[str, Any] = {"conf_file": str(_settings_file(progress, folder)), "hyperparams": {}, "env_kwargs": {}}
+    if is_file(cell.options.algo):
+        merged["algo"] = str(folder / "settings" / without_folder(cell.options.algo))
+    if cell.start_from is not None:
+        merged["trained_agent"] = str(folder / cell.start_from.name)
+    if tensorboard:
+        merged["tensorboard_log"] = str(progress.run.path / "tensorboard")
+    given = cell.options.model_dump(include=cell.options.model_fields_set)
     options = TrainOptions(**{**given, **merged, "n_timesteps": progress.total, "log_folder": str(folder)})
     return Job(
-        name=progress.cell.name,
+        name=cell.name,
         options=options.model_dump(include=options.model_fields_set),
         run=str(progress.run.path),
-        final_episodes=progress.cell.final_episodes,
+        final_episodes=cell.final_episodes,
+        conditions=cell.conditions,
         session=str(session),
     )
 
@@ -274,7 +315,7 @@ def _alone(folder: Path) -> Iterator[None]:
         raise ConfigError(f"-f: '{folder}' is being worked on by another process") from None
 
 
-def _run(options: BenchOptions, title: str, progress: list[Progress], folder: Path, study: Path) -> BenchResult:
+def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: Path, path: Path) -> BenchResult:
     from sb3_symphony.experiment.backends import open_backend
     from sb3_symphony.experiment.output import output_folder
 
@@ -289,13 +330,46 @@ def _run(options: BenchOptions, title: str, progress: list[Progress], folder: Pa
             new = not folder.exists()
             with _alone(output_folder(folder, "-f")):
                 session = _new_session(backend, folder, new)
-                _write_settings(progress, folder, study)
-                interrupted = _Session(progress, folder, session, backend).run()
+                interrupted = _search(study, progress, options, folder)
+                progress = _standings(study, path, folder)  # some had to wait for their settings
+                _write_settings(progress, folder, path)
+                while not interrupted and (ready := _ready(progress)):
+                    interrupted = _Session(progress, ready, folder, session, backend, study.tensorboard).run()
                 shutil.rmtree(session)
         finally:
             backend.close()
+    for each in progress:
+        if each.state == "queued" and not interrupted:
+            each.state, each.reason = "failed", each.reason or "the run that it starts from is not done"
     failed = [(each.cell.name, each.reason) for each in progress if each.state == "failed"]
-    return BenchResult(folder, report(title, progress, folder), failed, interrupted)
+    return BenchResult(folder, report(study, progress, folder), failed, interrupted)
+
+
+def _ready(progress: Sequence[Progress]) -> list[Progress]:
+    """Cells to do of which all is there that they begin with."""
+    done = {each.cell.name for each in progress if each.state == "done"}
+    queued = [each for each in progress if each.state == "queued" and not each.cell.waits]
+    return [each for each in queued if each.cell.start_from is None or each.cell.start_from.name in done]
+
+
+def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, folder: Path) -> bool:
+    """
+    Search for the settings that cells wait for.
+
+    :return: whether that was stopped by a signal
+    """
+    from sb3_symphony.experiment.tune import tune
+
+    cores = options.n_jobs or os.cpu_count() or 1
+    wanted = {each.cell.sweep.parent.name for each in progress if each.cell.sweep is not None and not each.kept}
+    for name in (name for name in study.sweeps if name in wanted):
+        sweep = sweep_options(study, name, folder)
+        n_jobs = max(1, cores // sweep.seeds_per_trial)
+        result = tune(sweep.model_copy(update={"n_jobs": n_jobs}))
+        print(result.summary, flush=True)
+        if result.interrupted:
+            return True
+    return False
 
 
 def _new_session(backend: "Backend", folder: Path, new: bool) -> Path:
@@ -316,15 +390,25 @@ class _Session:
     One execution of a grid: workers in a thread, while the main one looks after display, signals and signs of life.
 
     :param progress: all cells
+    :param ready: those to run
     :param folder: where results are kept
     :param session: folder of this execution
     :param backend: where to run them
+    :param tensorboard: whether they write TensorBoard logs
     """
 
-    def __init__(self, progress: list[Progress], folder: Path, session: Path, backend: "Backend") -> None:
+    def __init__(
+        self,
+        progress: list[Progress],
+        ready: list[Progress],
+        folder: Path,
+        session: Path,
+        backend: "Backend",
+        tensorboard: bool,
+    ) -> None:
         self.progress = progress
-        self.left = {each.cell.name: each for each in progress if not each.kept}
-        self.jobs = [_job(each, folder, session) for each in self.left.values()]
+        self.left = {each.cell.name: each for each in ready}
+        self.jobs = [_job(each, folder, session, tensorboard) for each in ready]
         self.control = Control(session / "control.json")
         self.backend = backend
         self.stop = 0  # how often that was asked for
@@ -393,16 +477,17 @@ class _Session:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def report(title: str, progress: Sequence[Progress], folder: Path) -> str:
+def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:
     """
     Write tables and figures of what is there.
 
-    :param title: heading
+    :param study: the study, with a title
     :param progress: all cells of the study
     :param folder: where their run folders are, and where to write
     :return: the Markdown tables
     :raises ConfigError: if a file of a run is damaged, or nothing can be written
     """
+    from sb3_symphony.analysis.matrix import matrix_rows, matrix_table, plot_matrix
     from sb3_symphony.analysis.tables import EPISODE_COLUMNS, as_csv, episode_rows, markdown_table, run_row
     from sb3_symphony.common.checkpoint import write_atomically
 
@@ -412,12 +497,24 @@ def report(title: str, progress: Sequence[Progress], folder: Path) -> str:
             [each for each in results if each.environment == env]
             for env in dict.fromkeys(each.environment for each in results)
         ]
-        table = "\n".join([f"## {title}", "", *map(markdown_table, by_environment)])
         rows = [run_row(each) for each in results]
-        cells, episodes = as_csv(rows[0], rows), as_csv(EPISODE_COLUMNS, episode_rows(results))
-        for name, content in {"table.md": table, "cells.csv": cells, "episodes.csv": episodes}.items():
+        files = {
+            "cells.csv": as_csv(rows[0], rows),
+            "episodes.csv": as_csv(EPISODE_COLUMNS, episode_rows(results)),
+        }
+        tables = [*map(markdown_table, by_environment)]
+        if study.matrix is not None:
+            names = list(study.matrix.conditions)
+            tables += [matrix_table(some, names, study.matrix.label) for some in by_environment]
+            entries = matrix_rows(results)
+            files["matrix.csv"] = as_csv(entries[0], entries) if entries else ""
+        table = "\n".join([f"## {study.title}", "", *tables])
+        for name, content in {"table.md": table, **files}.items():
             write_atomically(folder / name, content.encode())
         _draw(by_environment, folder)
+        if study.matrix is not None:
+            plot_matrix(results, list(study.matrix.conditions), study.matrix.label, folder / "matrix.png")
+        _draw_figures(study, results, folder)
     except ValueError as error:
         raise ConfigError(str(error)) from None
     except OSError as error:
@@ -437,6 +534,7 @@ def _result(progress: Progress) -> "Result":
         _thresholds(cell.environment),
         open_run(run.path) if (run.details / "args.yml").is_file() else None,
         read_result(run.path) if progress.state == "done" else None,
+        progress.reported,
     )
 
 
@@ -480,3 +578,22 @@ def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
             plot_curves(panels, "steps", "reward", smoothed, output)
         else:
             output.unlink(missing_ok=True)
+
+
+def _draw_figures(study: Study, results: Sequence["Result"], folder: Path) -> None:
+    """The study's own figures, of what there is to draw: a figure whose runs have not recorded it stays as it is."""
+    from sb3_symphony.analysis.runs import Group
+    from sb3_symphony.experiment.plot import plot
+
+    for name, figure in study.figures.items():
+        groups: dict[tuple[str, str], Group] = {}
+        for each in results:
+            if each.run is None or each.algorithm not in (figure.algorithms or [each.algorithm]):
+                continue
+            if each.environment in (figure.environments or [each.environment]):
+                group = groups.setdefault((each.algorithm, each.environment), Group(each.algorithm, each.environment, []))
+                group.runs.append(each.run)
+        try:
+            plot(figure.model_copy(update={"output": str(folder / f"{name}.png")}), list(groups.values()))
+        except ConfigError as error:
+            print(f"{name}.png is not drawn: {error}", flush=True)

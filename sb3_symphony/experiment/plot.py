@@ -45,11 +45,12 @@ class PlotOptions(BaseModel):
         return "scalars" if self.scalars or self.tags else "evaluations" if self.evaluations else "episodes"
 
 
-def plot(options: PlotOptions) -> Path:
+def plot(options: PlotOptions, groups: "list[Group] | None" = None) -> Path:
     """
     Draw the curves of runs.
 
     :param options: options of the command line
+    :param groups: the runs, if they are known; else the options say where to look for them
     :return: the image file
     :raises ConfigError: if there are no such runs, they did not record what is to be drawn, or a file cannot be written
     """
@@ -57,7 +58,7 @@ def plot(options: PlotOptions) -> Path:
 
     _check(options)
     try:
-        groups = _groups(options)
+        groups = _groups(options) if groups is None else groups
         output = Path(options.output or _default_output(options, groups))
         style.check_suffix(output)
         output_file(options.output or output, "--output")

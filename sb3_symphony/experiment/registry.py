@@ -1,6 +1,13 @@
-"""All algorithms by name. Nothing heavy is imported before :func:`load_algorithm` asks for a class."""
+"""
+All algorithms by name: ours, those of SB3 and SB3-Contrib, and ``FILE.py:Class`` for one of a user's own. Nothing heavy is
+imported before :func:`load_algorithm` asks for a class.
+"""
 
+import sys
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -31,12 +38,56 @@ LOADABLE: dict[str, tuple[str, str, str]] = {
 }
 
 
+def is_file(name: str) -> bool:
+    """
+    :param name: name of an algorithm
+    :return: whether it is ``FILE.py:Class``
+    """
+    return ".py:" in name
+
+
+def without_folder(name: str) -> str:
+    """
+    :param name: name of an algorithm
+    :return: the same, of ``FILE.py:Class`` without the folder of the file, which may have moved
+    """
+    return Path(name).name if is_file(name) else name
+
+
 def load_algorithm(name: str) -> type["BaseAlgorithm"]:
     """
-    Import an algorithm.
+    Import an algorithm. That of a file runs the file.
 
-    :param name: a key of :data:`LOADABLE`
+    :param name: a key of :data:`LOADABLE`, or ``FILE.py:Class``
     :return: its class
+    :raises ValueError: if the file has no such class
     """
-    module, class_name, _ = LOADABLE[name]
-    return getattr(import_module(module), class_name)
+    if not is_file(name):
+        module, class_name, _ = LOADABLE[name]
+        return getattr(import_module(module), class_name)
+
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    file, _, class_name = name.rpartition(":")
+    found = getattr(_module_of(Path(file).resolve()), class_name, None)
+    if not (isinstance(found, type) and issubclass(found, BaseAlgorithm)):
+        raise ValueError(f"{file}: has no algorithm '{class_name}' — expected a subclass of one of Stable-Baselines3's")
+    return found
+
+
+def _module_of(path: Path) -> ModuleType:
+    """The file as a module of its name, so that models which mention its classes can be loaded in any folder."""
+    there = sys.modules.get(path.stem)
+    if there is not None:
+        if getattr(there, "__file__", None) != str(path):
+            raise ValueError(f"{path}: there is a module '{path.stem}' already — expected another name of the file")
+        return there
+    spec = spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    sys.modules[path.stem] = module = module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[path.stem]
+        raise
+    return module

@@ -21,7 +21,7 @@ from sb3_symphony.experiment.config import (
     run_settings,
     shipped_folder,
 )
-from sb3_symphony.experiment.registry import LOADABLE
+from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
 _DEFAULT_ALGO, _DEFAULT_ENV = "symphony", "BipedalWalker-v3"
@@ -160,8 +160,10 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
         algo, env_id = algo or run.path.parent.name, env_id or run.env_name
     if algo is None:
         raise ConfigError(f"--algo: missing — expected the algorithm that trained {model}")
+    if options.algo is None and is_file(str(algo)):
+        raise ConfigError(f"--algo: missing — {model} was trained with {algo}, expected that, which runs the file's code")
     check_algorithm(str(algo), LOADABLE)
-    if run is not None and algo != trained.get("algo", algo):
+    if run is not None and without_folder(str(algo)) != without_folder(str(trained.get("algo", algo))):
         raise ConfigError(f"--algo: {algo} — {model} was trained with {trained['algo']}")
     if env_id is None:
         raise ConfigError(f"--env: missing — expected the environment that {model} is to act in")

@@ -1,31 +1,38 @@
 """
 A study: algorithms × environments × seeds, as a YAML file describes them. Each combination is a cell, one training run.
+Beside them it may name searches for hyper-parameters, whose best ones an algorithm is to use, and conditions under which
+final models are evaluated.
 
 Only YAML is read here; nothing heavy is imported.
 """
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator, model_validator
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import (
     ConfigError,
+    NamedList,
     RunConfig,
     TrainOptions,
     check_algorithm,
     load_config,
+    of_networks,
     read_yaml,
-    shipped_folder,
+    shipped_file,
     validated,
 )
+from sb3_symphony.experiment.plot import PlotOptions
+from sb3_symphony.experiment.registry import is_file
 from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.space import TuneOptions
 
 
 def _part(model: type[BaseModel], name: str | None, value: Any) -> Any:
@@ -49,15 +56,41 @@ def _some(value: Any) -> Any:
     return value
 
 
+_Item = TypeVar("_Item")
+_List = Annotated[list[_Item], BeforeValidator(_some)]
+_Seeds = Annotated[_List[Annotated[int, Field(ge=0, lt=2**31)]], BeforeValidator(_seeds)]
+
+
+class Start(BaseModel):
+    """
+    Where an algorithm takes its agents from: the networks at the end of another cell of the study, of the same seed.
+
+    :param algorithm: name of the other cell's algorithm, which comes before this one
+    :param environment: id of its environment
+    :param replay_buffer: whether the experience is taken over too
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    algorithm: str
+    environment: str
+    replay_buffer: bool = False
+
+
 class Algorithm(BaseModel):
     """
     A variant: an algorithm with its settings.
 
     :param name: what tables and folders call it
     :param algo: its algorithm, by default ``name``
-    :param conf: YAML file (relative to the study's folder) or preset, by default the shipped file
+    :param conf: YAML file (relative to the study's folder), preset or name of a shipped file; by default that of ``algo``
+    :param sweep: name of a search of the study, whose best settings it has instead
     :param overrides: hyper-parameters that go before those of the file
     :param steps: environment steps, which go before those of the environment and the study
+    :param seeds: seeds, which go before those of the study
+    :param environments: ids of the environments it runs on, by default all
+    :param start_from: agents that it starts from, by default new ones
+    :param reported: what others have reported of it, for a column of the table
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -65,8 +98,13 @@ class Algorithm(BaseModel):
     name: str
     algo: str = ""
     conf: str | None = None
+    sweep: str | None = None
     overrides: dict[str, Any] = {}
     steps: int | None = Field(default=None, ge=1)
+    seeds: _Seeds | None = None
+    environments: _List[str] | None = None
+    start_from: Annotated[Start | None, BeforeValidator(partial(_part, Start, None))] = None
+    reported: str = ""
 
     @field_validator("name")
     @classmethod
@@ -74,6 +112,12 @@ class Algorithm(BaseModel):
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", value):
             raise ValueError("expected letters, digits and . _ + - (it names a folder)")
         return value
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "Algorithm":
+        if self.conf is not None and self.sweep is not None:
+            raise ConfigError(f"{self.name}: conf and sweep: expected only one of them")
+        return self
 
 
 class Environment(BaseModel):
@@ -119,10 +163,45 @@ def _protocol(value: Any) -> Any:
     return validated(Protocol, value)
 
 
-_Item = TypeVar("_Item")
-_List = Annotated[list[_Item], BeforeValidator(_some)]
-_Seeds = Annotated[_List[Annotated[int, Field(ge=0, lt=2**31)]], BeforeValidator(_seeds)]
 _AnyProtocol = Annotated[Any, BeforeValidator(_protocol)]  # "standard" or Protocol
+
+
+class Condition(BaseModel):
+    """
+    What is different when final models are evaluated once more.
+
+    :param env_kwargs: arguments of the environment
+    :param env_wrapper: wrappers around it; one that the model was trained with has these arguments instead
+    :param obs_noise: standard deviation of noise on observations
+    :param action_delay: steps from an action to its effect
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    env_kwargs: dict[str, Any] = {}
+    env_wrapper: NamedList = []
+    obs_noise: FiniteFloat = Field(default=0.0, ge=0)
+    action_delay: int = Field(default=0, ge=0)
+
+
+def _conditions(value: Any) -> Any:
+    if not isinstance(value, dict) or not value:
+        raise ValueError("expected a mapping of names to what is different, such as {delayed: {action_delay: 2}}")
+    return {str(name): _part(Condition, None, condition) for name, condition in value.items()}
+
+
+class Matrix(BaseModel):
+    """
+    Evaluation of all final models under conditions of which each may have been trained under one.
+
+    :param label: what the names of the conditions are, such as ``torso mass (kg)``
+    :param conditions: name → what is different; names that are numbers are drawn as such
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    label: str
+    conditions: Annotated[dict[str, Condition], BeforeValidator(_conditions)]
 
 
 class Quick(BaseModel):
@@ -132,7 +211,8 @@ class Quick(BaseModel):
     :param algorithms: names of those to keep, by default all
     :param environments: ids of those to keep, by default all
     :param overrides: hyper-parameters for all algorithms, which go before their own
-    :param seeds: see :class:`Study`, as all others; steps go before those of algorithms and environments too
+    :param sweeps: options for all searches, which go before their own
+    :param seeds: see :class:`Study`, as all others; steps and seeds go before those of algorithms and environments too
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -145,6 +225,45 @@ class Quick(BaseModel):
     final_episodes: int | None = Field(default=None, ge=0)
     save_freq: int | None = Field(default=None, ge=1)
     overrides: dict[str, Any] = {}
+    sweeps: dict[str, Any] = {}
+
+
+#: options of ``tune`` that a study does not settle
+_NOT_OF_SWEEPS = ("log_folder", "n_jobs", "num_threads", "storage", "study_name", "show", "heartbeat", "device")
+
+
+def _sweeps(value: Any) -> Any:
+    if not isinstance(value, dict):
+        raise ValueError("expected a mapping of names to options of tune, such as {tuned: {algo: td3, n_trials: 50}}")
+    return {str(name): _sweep(options) for name, options in value.items()}
+
+
+def _sweep(options: Any) -> TuneOptions:
+    for name in _NOT_OF_SWEEPS:
+        if isinstance(options, dict) and name in options:
+            raise ConfigError(f"'{name}' — is for the command line")
+    return _part(TuneOptions, "algo", options)
+
+
+def _figures(value: Any) -> Any:
+    if not isinstance(value, dict):
+        raise ValueError("expected a mapping of file names to options of plot, such as {reward: {x_axis: episodes}}")
+    for name in value:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", str(name)):
+            raise ConfigError(f"'{name}' — expected letters, digits and _ - (it names a file)")
+    return {str(name): _part(Drawing, None, figure) for name, figure in value.items()}
+
+
+class Drawing(PlotOptions):
+    """
+    A figure of a study: options of ``plot``, and which of its runs.
+
+    :param algorithms: names of algorithms, by default all
+    :param environments: ids of environments, by default all
+    """
+
+    algorithms: _List[str] | None = None
+    environments: _List[str] | None = None
 
 
 class Study(BaseModel):
@@ -160,6 +279,10 @@ class Study(BaseModel):
     :param final_episodes: episodes on seeds 20 000, 20 001, … that the model is evaluated on at the end, 0: none
     :param save_freq: environment steps between checkpoints
     :param device: where networks run
+    :param matrix: conditions under which the models at the end are evaluated, on as many episodes
+    :param sweeps: name → options of ``tune``: searches whose best settings algorithms may have
+    :param figures: file name → options of ``plot``: figures beside the learning curves
+    :param tensorboard: whether runs log what figures of scalars draw
     :param quick: the version of a few minutes
     """
 
@@ -174,6 +297,10 @@ class Study(BaseModel):
     final_episodes: int = Field(default=100, ge=0)
     save_freq: int = Field(default=10_000, ge=1)
     device: str = "cpu"
+    matrix: Annotated[Matrix | None, BeforeValidator(partial(_part, Matrix, None))] = None
+    sweeps: Annotated[dict[str, TuneOptions], BeforeValidator(_sweeps)] = {}
+    figures: Annotated[dict[str, Drawing], BeforeValidator(_figures)] = {}
+    tensorboard: bool = False
     quick: Annotated[Quick | None, BeforeValidator(partial(_part, Quick, None))] = None
 
 
@@ -186,7 +313,10 @@ class Cell:
     :param environment: its environment
     :param seed: its seed
     :param options: options of ``train``
-    :param final_episodes: episodes to evaluate the model on at the end
+    :param final_episodes: episodes to evaluate the model on at the end, also under each condition
+    :param conditions: name → options of ``evaluate`` that differ
+    :param start_from: the cell whose agent it starts from, None: a new one
+    :param sweep: file of the search that its settings come from, None if there is none
     """
 
     algorithm: str
@@ -194,35 +324,93 @@ class Cell:
     seed: int
     options: TrainOptions
     final_episodes: int
+    conditions: dict[str, dict[str, Any]] = field(default_factory=dict)
+    start_from: "Cell | None" = None
+    sweep: Path | None = None
 
     @property
     def name(self) -> str:
         """Its run folder, in the folder of the study's results: that of the algorithm's name, as RL Zoo would have it."""
         return f"{self.algorithm}/{RunFolder.file_name(self.environment.id)}_{self.seed}"
 
+    @property
+    def waits(self) -> bool:
+        """Whether its settings are not known yet."""
+        return self.sweep is not None and not self.sweep.is_file()
 
-def read_study(path: Path, quick: bool = False) -> Study:
+
+def read_study(path: Path, quick: bool = False, only: Sequence[str] = ()) -> Study:
     """
     Read a study file.
 
     :param path: the file
     :param quick: the version of a few minutes
+    :param only: names of the algorithms to keep, and those that they start from; none: all
     :return: the study; the quick version without :attr:`Study.quick`
     :raises ConfigError: if it cannot be read, something is wrong in it, or a cell would be there twice
     """
     values = read_yaml(path, "a study")
     try:
         study: Study = validated(Study, values)
+        _check(study, path.absolute().parent)
         if quick:
             study = _quick(study)
-        for algorithm in study.algorithms:
-            check_algorithm(algorithm.algo or algorithm.name)
-        _check_twice("algorithms", [algorithm.name.lower() for algorithm in study.algorithms])  # folders, on any disk
-        _check_twice("environments", [RunFolder.file_name(environment.id) for environment in study.environments])
-        _check_twice("seeds", study.seeds)
+            _check(study, path.absolute().parent)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    return study
+    return _only(study, only) if only else study
+
+
+def _check(study: Study, folder: Path) -> None:
+    for algorithm in study.algorithms:
+        check_algorithm(_algo(algorithm, folder))
+    for name, sweep in study.sweeps.items():
+        try:
+            check_algorithm(sweep.algo)
+        except ConfigError as error:
+            raise ConfigError(f"sweeps: {name}: {error}") from None
+    _check_twice("algorithms", [algorithm.name.lower() for algorithm in study.algorithms])  # folders, on any disk
+    _check_twice("environments", [RunFolder.file_name(environment.id) for environment in study.environments])
+    environments = {each.id: each for each in study.environments}
+    algorithms: dict[str, Algorithm] = {}
+    for each in study.algorithms:
+        _check_twice(f"{each.name}: seeds" if each.seeds else "seeds", each.seeds or study.seeds)
+        _chosen(f"algorithms: {each.name}: environments", each.environments, environments)
+        if each.sweep is not None:
+            _chosen(f"algorithms: {each.name}: sweep", [each.sweep], study.sweeps)
+        if each.start_from is not None:
+            where = f"algorithms: {each.name}: start_from"
+            (source,) = _chosen(where, [each.start_from.algorithm], algorithms)
+            if source.start_from is not None:
+                raise ConfigError(f"{where}: {source.name} starts from another one itself — expected one that does not")
+            _chosen(where, [each.start_from.environment], _environments(study, source))
+            missing = set(each.seeds or study.seeds) - set(source.seeds or study.seeds)
+            if missing:
+                raise ConfigError(f"{where}: {source.name} has no seed {min(missing)}")
+        algorithms[each.name] = each
+    for name, figure in study.figures.items():
+        _chosen(f"figures: {name}: algorithms", figure.algorithms, algorithms)
+        _chosen(f"figures: {name}: environments", figure.environments, environments)
+
+
+def _algo(algorithm: Algorithm, folder: Path) -> str:
+    """The algorithm, where it is one of a file beside the study with the whole path."""
+    name = algorithm.algo or algorithm.name
+    return str(folder / name) if is_file(name) else name
+
+
+def _environments(study: Study, algorithm: Algorithm) -> dict[str, Environment]:
+    wanted = algorithm.environments
+    return {each.id: each for each in study.environments if wanted is None or each.id in wanted}
+
+
+def _only(study: Study, names: Sequence[str]) -> Study:
+    there = {each.name: each for each in study.algorithms}
+    wanted = {each.name for each in _chosen("-a", names, there)}
+    for each in reversed(study.algorithms):
+        if each.name in wanted and each.start_from is not None:
+            wanted.add(each.start_from.algorithm)
+    return study.model_copy(update={"algorithms": [each for each in study.algorithms if each.name in wanted]})
 
 
 def _check_twice(key: str, values: Sequence[Any]) -> None:
@@ -231,14 +419,14 @@ def _check_twice(key: str, values: Sequence[Any]) -> None:
         raise ConfigError(f"{key}: {value!r} is there {count} times — expected every cell once")
 
 
-def _chosen(key: str, wanted: Iterable[str] | None, there: dict[str, Any]) -> list[Any]:
-    """Those that the quick version names, in their order."""
+def _chosen(key: str, wanted: Iterable[str] | None, there: Mapping[str, Any]) -> list[Any]:
+    """Those that are named, in their order."""
     if wanted is None:
         return list(there.values())
     for name in wanted:
         if name not in there:
-            near = suggestion(name, there) or f" — expected some of {', '.join(there)}"
-            raise ConfigError(f"quick: {key}: unknown name '{name}'{near}")
+            near = suggestion(name, there) or f" — expected some of {', '.join(there) or 'those before'}"
+            raise ConfigError(f"{key}: unknown name '{name}'{near}")
     return [there[name] for name in wanted]
 
 
@@ -246,57 +434,114 @@ def _quick(study: Study) -> Study:
     if study.quick is None:
         raise ConfigError("quick: missing — expected what differs in the quick version, such as {seeds: 1, steps: 1500}")
     quick = study.quick
-    algorithms = _chosen("algorithms", quick.algorithms, {each.name: each for each in study.algorithms})
-    environments = _chosen("environments", quick.environments, {each.id: each for each in study.environments})
+    algorithms = _chosen("quick: algorithms", quick.algorithms, {each.name: each for each in study.algorithms})
+    environments = _chosen("quick: environments", quick.environments, {each.id: each for each in study.environments})
+    there = {each.id for each in environments}
     without_steps = {"steps": None} if quick.steps else {}
+    without_own = {**without_steps, **({"seeds": None} if quick.seeds else {})}
     changes = {
         name: value
         for name in ("seeds", "steps", "protocol", "final_episodes", "save_freq")
         if (value := getattr(quick, name)) is not None
     }
+    kept = [each for each in algorithms if each.environments is None or there.intersection(each.environments)]
     return study.model_copy(
         update={
             **changes,
             "algorithms": [
-                each.model_copy(update={"overrides": {**each.overrides, **quick.overrides}, **without_steps})
-                for each in algorithms
+                each.model_copy(
+                    update={
+                        "overrides": {**each.overrides, **quick.overrides},
+                        "environments": each.environments and [env for env in each.environments if env in there],
+                        **without_own,
+                    }
+                )
+                for each in kept
             ],
             "environments": [each.model_copy(update=without_steps) for each in environments],
+            "sweeps": {
+                name: _sweep({**sweep.model_dump(include=sweep.model_fields_set), **quick.sweeps})
+                for name, sweep in study.sweeps.items()
+            },
+            "figures": {
+                name: each.model_copy(update={"algorithms": some, "environments": None})
+                for name, each in study.figures.items()
+                if (some := [one.name for one in kept if each.algorithms is None or one.name in each.algorithms])
+            },
             "quick": None,
         }
     )
 
 
-def cells_of(study: Study, folder: Path) -> list[Cell]:
+def cells_of(study: Study, folder: Path, results: Path | None = None) -> list[Cell]:
     """
     :param study: a study
     :param folder: folder of the study file
-    :return: its cells, seed by seed, so that all algorithms progress alike
+    :param results: folder of its results, where settings that it searches for are kept; by default as ``folder``
+    :return: its cells, the first seed of each algorithm first, so that all algorithms progress alike
     """
-    return [
-        Cell(algorithm.name, environment, seed, _options(study, algorithm, environment, seed, folder), study.final_episodes)
-        for seed in study.seeds
-        for environment in study.environments
-        for algorithm in study.algorithms
-    ]
+    known: dict[str, Cell] = {}
+    seeds = {each.name: each.seeds or study.seeds for each in study.algorithms}
+    for index in range(max(map(len, seeds.values()))):
+        for environment in study.environments:
+            for algorithm in study.algorithms:
+                if index < len(seeds[algorithm.name]) and environment.id in _environments(study, algorithm):
+                    seed = seeds[algorithm.name][index]
+                    cell = _cell(study, algorithm, environment, seed, folder, results or folder)
+                    known[cell.name] = cell
+    sources = {each.name: each.start_from for each in study.algorithms}
+    cells: dict[str, Cell] = {}
+    for name, cell in sorted(known.items(), key=lambda item: sources[item[1].algorithm] is not None):
+        source = sources[cell.algorithm]
+        if source is not None:
+            begun = cells[f"{source.algorithm}/{RunFolder.file_name(source.environment)}_{cell.seed}"]
+            cell = replace(cell, start_from=begun)
+        cells[name] = cell
+    return list(cells.values())
 
 
-def _options(study: Study, algorithm: Algorithm, environment: Environment, seed: int, folder: Path) -> TrainOptions:
+def _cell(study: Study, algorithm: Algorithm, environment: Environment, seed: int, folder: Path, results: Path) -> Cell:
+    matrix = study.matrix
+    conditions = {} if matrix is None else {name: each.model_dump() for name, each in matrix.conditions.items()}
+    sweep = None
+    if algorithm.sweep is not None:
+        sweep = sweep_options(study, algorithm.sweep, results).folder / "best.yml"
+    options = _options(study, algorithm, environment, seed, folder, sweep)
+    return Cell(algorithm.name, environment, seed, options, study.final_episodes, conditions, sweep=sweep)
+
+
+def sweep_options(study: Study, name: str, results: Path) -> TuneOptions:
+    """
+    :param study: a study
+    :param name: name of one of its searches
+    :param results: folder of its results
+    :return: options of ``tune``
+    """
+    settled = {"log_folder": str(results / "sweeps"), "study_name": name, "device": study.device, "num_threads": 1}
+    return study.sweeps[name].model_copy(update=settled)
+
+
+def _options(
+    study: Study, algorithm: Algorithm, environment: Environment, seed: int, folder: Path, sweep: Path | None
+) -> TrainOptions:
     conf = algorithm.conf
-    if conf is not None and not (shipped_folder() / "presets" / f"{conf}.yml").is_file():
+    if conf is not None and shipped_file(conf) is None:
         conf = str(folder / conf)
+    if sweep is not None and sweep.is_file():
+        conf = str(sweep)
     if study.protocol == "standard":
         evaluation: dict[str, Any] = {"protocol": "standard", "threshold": environment.threshold}
     else:
         evaluation = study.protocol.model_dump()
     return TrainOptions(
-        algo=algorithm.algo or algorithm.name,
+        algo=_algo(algorithm, folder),
         env=environment.id,
         n_timesteps=algorithm.steps or environment.steps or study.steps or -1,
         seed=seed,
         conf_file=conf,
         hyperparams=algorithm.overrides,
         env_kwargs=environment.env_kwargs,
+        with_replay_buffer=algorithm.start_from is not None and algorithm.start_from.replay_buffer,
         save_freq=study.save_freq,
         device=study.device,
         num_threads=1,
@@ -313,6 +558,7 @@ def configuration(cell: Cell) -> RunConfig:
     :raises ConfigError: if a file or key is wrong, with the name of the variant
     """
     try:
-        return load_config(cell.options)
+        inherited = {} if cell.start_from is None else of_networks(configuration(cell.start_from).plain)
+        return load_config(cell.options, inherited)
     except ConfigError as error:
         raise ConfigError(f"{cell.algorithm} on {cell.environment.id}: {error}") from None

@@ -106,7 +106,10 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
     :return: the model, its environment set
     :raises ConfigError: if something of the configuration does not fit
     """
-    algorithm = load_algorithm(options.algo)
+    try:
+        algorithm = load_algorithm(options.algo)
+    except ValueError as error:  # of a user's own file
+        raise ConfigError(f"--algo: {error}") from None
     check_device(options.device)
     import_packages(options.gym_packages)
     gamma = config.arguments.get("gamma")

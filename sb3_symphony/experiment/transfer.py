@@ -14,12 +14,9 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_symphony.common.checkpoint import DamagedCheckpoint, ReplaySegments, add_transitions, newest_checkpoint
 from sb3_symphony.experiment.agent import check_match, load_model, load_normalization
-from sb3_symphony.experiment.config import ConfigError, TrainOptions, read_yaml
+from sb3_symphony.experiment.config import ConfigError, TrainOptions, of_networks, read_yaml
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import Selection, SelectOptions, select_model
-
-#: what settles the networks of an agent and what they are given: taken from the run that trained it
-_NETWORKS = ("policy", "policy_kwargs", "n_critics", "use_sde", "normalize", "frame_stack")
 
 
 def find_trained(options: TrainOptions) -> Selection:
@@ -43,8 +40,7 @@ def inherited(selection: Selection) -> dict[str, Any]:
     if selection.run is None:
         return {}
     (path,) = sorted(selection.run.glob("*/config.yml"))[:1]
-    config = read_yaml(path)
-    return {key: config.get(key) for key in _NETWORKS if config.get(key) is not None or key in ("normalize", "frame_stack")}
+    return of_networks(read_yaml(path))
 
 
 def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: bool) -> None:
