@@ -3,11 +3,13 @@
 import csv
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 
+from sb3_symphony.analysis.matrix import matrix_rows, matrix_table, plot_matrix, positions
 from sb3_symphony.analysis.runs import open_run
 from sb3_symphony.analysis.tables import EPISODE_COLUMNS, Result, Thresholds, as_csv, episode_rows, markdown_table, run_row
 
@@ -73,10 +75,12 @@ def test_markdown_by_hand(result):
         "maximum",
         "final IQM (95 % CI)",
         "final episodes",
+        "final length",
         "updates",
         "wall-clock",
     ]
     assert (a["algorithm"], a["seeds"], a["steps"]) == ("a", "3", "2 000 or 3 000")
+    assert a["final length"] == "9 ± 0"
     assert a["S300 median"] == "2 000"  # 2000, 1000, > 5000
     assert a["S300 IQM (95 % CI)"].startswith("> 2 667 (1 000 … > 5 000")  # the mean: with three nothing is cut
     assert a["E300"] == "3 (1 500)"  # episodes 2, 3, > 6: steps 1000, 1500, > 3000
@@ -173,3 +177,56 @@ def test_before_the_first_episode(result):
     assert second["stable_step"] == ""
     (row,), _ = table_of(results)
     assert row["seeds"] == "0 of 2"
+
+
+def test_what_others_reported(result):
+    ours, theirs = result("a", 0, [1], [1]), result("b", 0, [1], [1])
+    (a, b), _ = table_of([ours, replace(theirs, reported="300 ± 5")])
+    assert (a["reported"], b["reported"]) == ("–", "300 ± 5")
+    assert "reported" not in table_of([ours, theirs])[0][0]
+
+
+def under(returns):
+    return {"seed": 20_000, "returns": returns, "lengths": [3] * len(returns), "successes": [None] * len(returns)}
+
+
+@pytest.fixture
+def matrix(result):
+    """Two algorithms under three conditions, one of two seeds not done and one condition missing."""
+    conditions = {"2": under([1.0, 3.0]), "4": under([10.0, 20.0]), "10": under([100.0, 100.0])}
+    runs = [result("a", 0, [1], [1]), result("a", 1, [1], [1]), result("b", 0, [1], [1]), result("c", 0, [1], [1], done=False)]
+    runs[0].summary["conditions"] = conditions
+    runs[1].summary["conditions"] = {**conditions, "2": under([5.0, 7.0])}
+    runs[2].summary["conditions"] = {"2": under([0.0, 0.0])}
+    return runs
+
+
+def test_matrix(matrix, tmp_path):
+    names = ["2", "4", "10"]
+    heading, _, columns, rule, a, b, c, *_ = matrix_table(matrix, names, "mass (kg)").splitlines()
+    assert heading == "### X-v0: mass (kg)" and set(rule) <= set("|-:")
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (columns, a, b, c)]
+    assert cells == [
+        ["mass (kg):", "2", "4", "10"],
+        ["a", "4 ± 2", "15 ± 5", "100 ± 0"],  # 1, 3, 5, 7: variance 5
+        ["b", "0 ± 0", "–", "–"],
+        ["c", "–", "–", "–"],
+    ]
+    rows = matrix_rows(matrix)
+    assert [(row["algorithm"], row["seed"], row["condition"]) for row in rows] == [
+        *(("a", seed, name) for seed in (0, 1) for name in names),
+        ("b", 0, "2"),
+    ]
+    assert (rows[1]["mean"], rows[1]["std"], rows[1]["iqm"], rows[1]["episodes"]) == (15, 5, 15, 2)
+    episodes = [row for row in episode_rows(matrix) if row["kind"] == "condition 10"]
+    assert [(row["algorithm"], row["seed"], row["environment_seed"], row["return"]) for row in episodes] == [
+        ("a", seed, 20_000 + i, 100.0) for seed in (0, 1) for i in range(2)
+    ]
+    output = tmp_path / "matrix.png"
+    assert plot_matrix(matrix, names, "mass (kg)", output) == output and output.stat().st_size > 10_000
+    assert plot_matrix(matrix[3:], names, "mass (kg)", output) is None and not output.exists()  # nothing to draw any more
+
+
+def test_places_of_conditions():
+    assert positions(["2", "4", "10"]).tolist() == [2, 4, 10]
+    assert positions(["as trained", "delayed"]).tolist() == [0, 1]

@@ -64,8 +64,11 @@ def matrix_table(results: Sequence[Result], names: Sequence[str], label: str) ->
     return "\n".join([f"### {results[0].environment}: {label}", "", *aligned(rows), "", *lines, ""])
 
 
-def _positions(names: Sequence[str]) -> np.ndarray:
-    """Where conditions are on an axis: at their values if all are numbers."""
+def positions(names: Sequence[str]) -> np.ndarray:
+    """
+    :param names: names of conditions
+    :return: where they are on an axis: at their values if all are numbers, else evenly, shape ``(n,)``
+    """
     try:
         return np.array([float(name) for name in names])
     except ValueError:
@@ -120,7 +123,7 @@ def _draw(figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Seque
     heat.set_title("mean return")
     heat.grid(visible=False)
 
-    at = _positions(names)
+    at = positions(names)
     for index, entries in enumerate(rows.values()):
         known = [i for i, each in enumerate(entries) if each is not None]
         spread = [entries[i].std() for i in known]  # type: ignore[union-attr]  # only those that are known

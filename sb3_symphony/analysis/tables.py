@@ -75,6 +75,11 @@ class Result:
         """Returns of the episodes that the model was evaluated on at the end, shape ``(n,)``."""
         return np.array((self.summary or {}).get("final", {}).get("returns", []), dtype=np.float64)
 
+    @property
+    def final_lengths(self) -> np.ndarray:
+        """Their numbers of steps, shape ``(n,)``."""
+        return np.array((self.summary or {}).get("final", {}).get("lengths", []), dtype=np.float64)
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # CSV
@@ -187,6 +192,8 @@ def run_row(result: Result) -> Row:
         "final_mean": None if final is None else final.mean,
         "final_std": None if final is None else final.std,
         "final_iqm": None if final is None else final.iqm,
+        "final_length": None if final is None else float(result.final_lengths.mean()),
+        "final_length_std": None if final is None else float(result.final_lengths.std()),
     }
 
 
@@ -251,6 +258,11 @@ def _final_episodes(done: Sequence[Result]) -> str:
     return f"{returns.mean():.1f} ± {returns.std():.1f}, {iqm(returns):.1f}" if len(returns) else _NOTHING
 
 
+def _final_length(done: Sequence[Result]) -> str:
+    lengths = np.concatenate([each.final_lengths for each in done])
+    return f"{_number(lengths.mean())} ± {_number(lengths.std())}" if len(lengths) else _NOTHING
+
+
 Column = tuple[str, Callable[[Sequence[Result]], str]]
 
 
@@ -270,7 +282,11 @@ def _columns(results: Sequence[Result]) -> list[Column]:
             columns.append(("unstable", _unstable))
     columns.append(("maximum", _maximum))
     if any(len(each.final) for each in results):
-        columns += [("final IQM (95 % CI)", _final_iqm), ("final episodes", _final_episodes)]
+        columns += [
+            ("final IQM (95 % CI)", _final_iqm),
+            ("final episodes", _final_episodes),
+            ("final length", _final_length),
+        ]
     columns += [
         ("updates", lambda done: _number(np.median([_summary(each)["updates"] for each in done]))),
         ("wall-clock", lambda done: _duration(float(np.median([_summary(each)["seconds"] for each in done])))),
@@ -347,7 +363,7 @@ def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
         episodes = " or ".join(map(str, final))
         lines.append(
             f"- final: the model at the end, deterministic, {episodes} episodes: IQM over the seeds' means; mean ± standard "
-            "deviation and IQM of all episodes"
+            "deviation and IQM of all episodes; mean ± standard deviation of their lengths"
         )
     lines.append(
         "- updates, wall-clock (with evaluations, several runs at a time): median over seeds. IQM: interquartile mean; CI: "

@@ -249,8 +249,10 @@ def _figures(value: Any) -> Any:
     if not isinstance(value, dict):
         raise ValueError("expected a mapping of file names to options of plot, such as {reward: {x_axis: episodes}}")
     for name in value:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", str(name)):
-            raise ConfigError(f"'{name}' — expected letters, digits and _ - (it names a file)")
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", str(name)) or name in ("evaluations", "training", "matrix"):
+            raise ConfigError(
+                f"'{name}' — expected letters, digits and _ -, and not the name of a figure that all studies have"
+            )
     return {str(name): _part(Drawing, None, figure) for name, figure in value.items()}
 
 
