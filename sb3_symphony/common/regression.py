@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch.autograd.function import once_differentiable
 
-from sb3_symphony.common.ensembles import EnsembleCritic
+from sb3_symphony.common.ensembles import EnsembleCritic, StackedMLP
 from sb3_symphony.common.fused import FusedNetwork, array, uncovered
 from sb3_symphony.common.kernels import adam_polyak
 from sb3_symphony.common.losses import CRITIC_LOSS_SLOPES, CRITIC_LOSSES
@@ -206,6 +206,8 @@ def not_fusable(critic: EnsembleCritic) -> str | None:
         return f"the device is {critic.device}, not the CPU"
     if type(critic.features_extractor) is not FlattenExtractor:
         return f"the features extractor is {type(critic.features_extractor).__name__}, not FlattenExtractor"
+    if type(critic.q_networks) is not StackedMLP:  # a subclass may compute something else
+        return f"the networks are {type(critic.q_networks).__name__}, not StackedMLP"
     if (layer := uncovered(critic.q_networks)) is not None:
         return f"no hand-written passes for {layer}"
     if type(optimizer) not in (th.optim.Adam, th.optim.AdamW):

@@ -48,11 +48,9 @@ def plain_table(progress: "Sequence[Progress]") -> str:
     :param progress: all cells
     :return: state and steps of each, as text
     """
-    rows = [_cells(each)[:4] for each in progress]
-    widths = [max(map(len, column)) for column in zip(_COLUMNS[:4], *rows, strict=True)]
-    lines = [
-        "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in (_COLUMNS[:4], *rows)
-    ]
+    rows = [(*_COLUMNS[:4], ""), *([*_cells(each)[:4], each.reason] for each in progress)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join([*lines, _counts(progress)])
 
 
@@ -68,7 +66,7 @@ class View:
         self.console = Console(file=sys.stdout)
         self.live = Live(console=self.console, auto_refresh=False) if self.console.is_terminal else None
         # What was told of each cell, and when
-        self.told = {each.cell.name: ("done" if each.kept else "queued", each.steps, 0.0) for each in progress}
+        self.told = {each.cell.name: (each.state, each.steps, 0.0) for each in progress}
         self.stopping = False
 
     def __enter__(self) -> "View":

@@ -130,12 +130,14 @@ class Environment(BaseModel):
     :param unstable_below: return below which an episode counts as a failure once it is solved, by default two thirds of a
         positive threshold
     :param steps: environment steps, which go before those of the study
+    :param overrides: hyper-parameters that go before those of a file, but not before an algorithm's own
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: str
     env_kwargs: dict[str, Any] = {}
+    overrides: dict[str, Any] = {}
     threshold: FiniteFloat | None = None
     unstable_below: FiniteFloat | None = None
     steps: int | None = Field(default=None, ge=1)
@@ -541,7 +543,7 @@ def _options(
         n_timesteps=algorithm.steps or environment.steps or study.steps or -1,
         seed=seed,
         conf_file=conf,
-        hyperparams=algorithm.overrides,
+        hyperparams={**environment.overrides, **algorithm.overrides},
         env_kwargs=environment.env_kwargs,
         with_replay_buffer=algorithm.start_from is not None and algorithm.start_from.replay_buffer,
         save_freq=study.save_freq,
