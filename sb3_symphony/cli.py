@@ -1,9 +1,11 @@
 """Command line: arguments only. Each command calls one function of :mod:`sb3_symphony.experiment`, imported when needed."""
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from functools import partial
 from typing import Any, NoReturn
 
@@ -35,41 +37,41 @@ _TRAIN_EXAMPLES = """examples:
 
 _EVALUATE_EXAMPLES = """examples:
   sb3-symphony evaluate --algo sac --env Pendulum-v1 --load-best
-  sb3-symphony evaluate --model ppo.zip --algo ppo --env Hopper-v5 --vecnormalize stats.pkl --json out.json
+  sb3-symphony evaluate --model ppo.zip --algo ppo --env Hopper-v5 --vecnormalize stats.pkl
   sb3-symphony evaluate --model logs/sac/Pendulum-v1_1 --obs-noise 0.05 --action-delay 2
 """
 _ENJOY_EXAMPLES = """examples:
-  sb3-symphony enjoy                                   the latest run of Symphony on BipedalWalker-v3
+  sb3-symphony enjoy                                  the latest run of Symphony on BipedalWalker-v3
   sb3-symphony enjoy --algo sac --env Pendulum-v1 --load-best -n 5000
   sb3-symphony enjoy --model logs/sac/Pendulum-v1_1 --seed 20017 --no-render
 """
 _EXPORT_EXAMPLES = """examples:
   sb3-symphony export --algo sac --env Pendulum-v1 --load-best
-  sb3-symphony export --model ppo.zip --algo ppo --env Hopper-v5 --vecnormalize stats.pkl -o robot.onnx
+  sb3-symphony export --model ppo.zip --algo ppo --env Hopper-v5 -o robot.onnx
 """
 _VIDEO_EXAMPLES = """examples:
-  sb3-symphony video                                   the latest run of Symphony on BipedalWalker-v3
+  sb3-symphony video                                  the latest run of Symphony on BipedalWalker-v3
   sb3-symphony video --algo sac --env Hopper-v5 --load-best -n 500 -o hopper.gif --width 300
-  sb3-symphony video logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 --grid -l Symphony REDQ
+  sb3-symphony video logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 --grid
 """
 _GAIT_EXAMPLES = """examples:
-  sb3-symphony gait                                    the latest run of Symphony on BipedalWalker-v3
+  sb3-symphony gait                                   the latest run of Symphony on BipedalWalker-v3
   sb3-symphony gait logs/symphony/BipedalWalker-v3_1 logs/redq/BipedalWalker-v3_1 -o gaits.svg
 """
 _TUNE_EXAMPLES = """examples:
   sb3-symphony tune --algo td3 --n-trials 200 --n-jobs 2
   sb3-symphony tune --algo ppo --env Pendulum-v1 -n 50000 --seeds-per-trial 2 -params gamma:0.9
-  sb3-symphony tune --storage postgresql://me@database.lab/sweeps --n-jobs 4     the same on each machine
+  sb3-symphony tune --storage postgresql://me@database.lab/sweeps      on each machine
   sb3-symphony tune --show
 """
 _BENCH_EXAMPLES = """examples:
   sb3-symphony bench benchmarks/studies/bipedalwalker/study.yml --quick
-  sb3-symphony bench study.yml -j 8                       the same command goes on after Ctrl-C, kill -9 or a power cut
+  sb3-symphony bench study.yml -j 8                   again: goes on after Ctrl-C or a power cut
   sb3-symphony bench study.yml --backend ray --address 192.168.0.10:6379 -f /shared/results
-  sb3-symphony bench study.yml --report                   tables and figures anew, from the results that are there
+  sb3-symphony bench study.yml --report               tables and figures of the results so far
 """
 _PLOT_EXAMPLES = """examples:
-  sb3-symphony plot                                        all runs in logs, a panel for each environment
+  sb3-symphony plot                                   all runs in logs, a panel per environment
   sb3-symphony plot -a symphony sac -e BipedalWalker-v3 -o walker.svg
   sb3-symphony plot -a symphony -e BipedalWalker-v3 -x episodes --mean-per 10
   sb3-symphony plot logs/sac/Pendulum-v1_1 logs/sac/Pendulum-v1_2 --evaluations -x time
@@ -93,6 +95,13 @@ class _Parser(argparse.ArgumentParser):
         """
         self.error(f"unknown argument '{argument}'{suggestion(argument, self._option_string_actions)}")
 
+    def takes(self, option: str) -> bool:
+        """
+        :param option: such as ``--progress``
+        :return: whether there is such an option
+        """
+        return option in self._option_string_actions
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
             choices = [str(choice) for choice in action.choices]
@@ -100,9 +109,13 @@ class _Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(None, f"unknown {action.dest} '{value}'{near}")
 
 
+def _add_quiet(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--quiet", dest="silent", action="store_true", help="print nothing but errors")
+
+
 class _Formatter(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=34, width=110)
+        super().__init__(prog, max_help_position=34, width=100)
 
     def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
         return f"{action.metavar} ..." if action.nargs == "+" else super()._format_args(action, default_metavar)
@@ -133,21 +146,21 @@ def _add_train(commands: Any) -> None:
         "train",
         help="train an agent",
         usage="%(prog)s [--algo ALGO] [--env ENV] [options]",
-        description="Train an agent; files go to <log-folder>/<algo>/<env>_<k>/.",
+        description="Train an agent, by default symphony; files go to <log-folder>/<algo>/<env>_<k>/.",
         epilog=_TRAIN_EXAMPLES,
     )
     # Only what is given reaches the options, so that --resume can tell it from the defaults
     add = partial(parser.add_argument, default=argparse.SUPPRESS)
     default = TrainOptions()
-    add("--algo", metavar="ALGO", help=", ".join([f"{default.algo} (default)", *list(ALGORITHMS)[1:]]))
+    add("--algo", metavar="ALGO", help=", ".join(ALGORITHMS))
     add("--env", metavar="ID", help=f"registered environment (default: {default.env})")
     add("--gym-packages", nargs="+", metavar="M", help="modules to import, which register environments")
     add("-n", "--n-timesteps", type=_whole_number, metavar="N", help="environment steps (default: the configuration's)")
     add("--seed", type=_whole_number, metavar="N", help=f"seed; -1 draws one (default: {default.seed})")
     add("--n-seeds", type=_whole_number, metavar="K", help="K runs one after the other, on seeds N, N + 1, … (default: 1)")
-    agent = "start from a trained agent's networks: model's zip file or run folder"
+    agent = "start from a trained agent: model's zip file or run folder"
     add("-i", "--trained-agent", metavar="PATH", help=agent)
-    add("--with-replay-buffer", action="store_true", help="with -i: and from its replay buffer")
+    add("--with-replay-buffer", action="store_true", help="with -i: take over its replay buffer too")
     add("-f", "--log-folder", metavar="DIR", help=f"where runs are kept (default: {default.log_folder})")
     every, episodes = f"(default: {default.eval_freq})", f"(default: {default.eval_episodes})"
     add("--eval-freq", type=_whole_number, metavar="N", help=f"steps between evaluations, 0: none {every}")
@@ -155,14 +168,14 @@ def _add_train(commands: Any) -> None:
     add("--protocol", metavar="P", choices=("standard",), help="evaluate as all published tables do: standard")
     add("--threshold", type=float, metavar="R", help="return that solves it, for --protocol (default: as registered)")
     add("-params", "--hyperparams", nargs="+", metavar="K:V", help="override hyper-parameters; values are YAML")
-    add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset to use, e.g. symphony-original (default: shipped)")
+    add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset, e.g. symphony-original (default: shipped)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
     add("--eval-env-kwargs", nargs="+", metavar="K:V", help="those of the evaluations, over these")
     add("--vec-env", metavar="KIND", choices=("dummy", "subproc"), help="subproc: a process for each of n_envs")
     add("-tb", "--tensorboard-log", metavar="DIR", help="write TensorBoard logs there")
     add("--save-freq", type=_whole_number, metavar="N", help="steps between checkpoints (default: none)")
     add("--keep", type=_whole_number, metavar="K", help=f"checkpoints to keep (default: {default.keep})")
-    add("--resume", metavar="RUN_FOLDER", help="go on with a run from its newest checkpoint, up to its -n or a larger one")
+    add("--resume", metavar="RUN_FOLDER", help="go on with a run from its newest checkpoint")
     add("--device", help=f"auto, cpu or cuda (default: {default.device})")
     add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch (default: PyTorch's)")
     add("--log-interval", type=_whole_number, metavar="N", help="episodes between log lines, -1: default, -2: none")
@@ -170,7 +183,7 @@ def _add_train(commands: Any) -> None:
     add("--verbose", type=int, choices=(0, 1, 2), help="log to the terminal (default: 1, with a progress bar 0)")
     add("--quiet", action="store_true", help="print nothing but errors")
     add("--json", dest="json_file", metavar="OUT", help="write results as JSON; -: print them so, and nothing else")
-    add("--dry-run", action="store_true", help="only print the whole configuration, and where each value comes from")
+    add("--dry-run", action="store_true", help="only print the configuration, and where each value is from")
     parser.set_defaults(run=_train, parser=parser)
 
 
@@ -214,10 +227,10 @@ def _add_selection(parser: argparse.ArgumentParser, several: bool = False) -> No
     """The flags of :class:`SelectOptions`, which all commands on trained agents share; ``several`` may be given by name."""
     add = partial(parser.add_argument_group("which agent").add_argument, default=argparse.SUPPRESS)
     if several:
-        add("agents", nargs="*", metavar="AGENT", help="model's zip file or run folder (default: found by the next flags)")
-    add("--model", metavar="PATH", help="model's zip file, or a run folder (default: found by the next flags)")
-    add("--algo", metavar="ALGO", help="its algorithm (default: the run's; without --model symphony)")
-    add("--env", metavar="ID", help="its environment (default: the run's; without --model BipedalWalker-v3)")
+        add("agents", nargs="*", metavar="AGENT", help="model's zip file or run folder (default: found by what follows)")
+    add("--model", metavar="PATH", help="model's zip file, or run folder (default: found by what follows)")
+    add("--algo", metavar="ALGO", help="its algorithm (default: the run's; else symphony)")
+    add("--env", metavar="ID", help="its environment (default: the run's; else BipedalWalker-v3)")
     add("-f", "--folder", metavar="DIR", help=f"where runs are kept (default: {SelectOptions().folder})")
     add("--exp-id", type=_whole_number, metavar="N", help="number of the run; -1: no run folder (default: 0, the latest)")
     add("--load-best", action="store_true", help="model with the best evaluation instead of the last one")
@@ -265,6 +278,7 @@ def _add_evaluate(commands: Any) -> None:
     add("--action-delay", type=_whole_number, metavar="K", help="steps from an action to its effect (default: 0)")
     add("--json", dest="json_file", metavar="OUT", help="write results as JSON; -: print them so")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
+    _add_quiet(parser)
     parser.set_defaults(run=_evaluate, parser=parser)
 
 
@@ -359,8 +373,9 @@ def _add_video(commands: Any) -> None:
     add = _add_agents(parser, "film, .mp4 or .gif (default: in the run's folder videos)")
     add("--grid", action="store_true", help="all agents side by side in one film (default: a film for each)")
     add("--n-episodes", type=_whole_number, metavar="N", help="episodes in a film; the next seeds (default: 1)")
-    add("--fps", type=_whole_number, metavar="N", help="pictures per second (default: the environment's, at most 50, GIF 25)")
+    add("--fps", type=_whole_number, metavar="N", help="pictures per second (default: the environment's, up to 50, GIF 25)")
     add("--width", type=_whole_number, metavar="N", help="pixels for each agent (default: the environment's, in a grid 400)")
+    _add_quiet(parser)
     parser.set_defaults(run=_video, parser=parser)
 
 
@@ -379,14 +394,15 @@ def _add_gait(commands: Any) -> None:
         "gait",
         help="draw and measure how trained agents walk (BipedalWalker)",
         usage="%(prog)s [AGENT ...] [which agent] [options]",
-        description="Measure an episode of BipedalWalker: cadence, duty factor, symmetry; draw foot contact and joint angles.",
+        description="Measure how agents walk: cadence, duty factor, symmetry; draw foot contact and joint angles.",
         epilog=_GAIT_EXAMPLES,
     )
     add = _add_agents(parser, ".png, .svg or .pdf (default: gait.png in the run's folder)")
-    add("--skip", type=float, metavar="S", help="seconds of the episode that are left out at its beginning (default: 2)")
+    add("--skip", type=float, metavar="S", help="seconds left out at the episode's beginning (default: 2)")
     add("--window", type=float, metavar="S", help="seconds that are drawn; numbers are of all that follow (default: 2)")
     add("--n-frames", type=_whole_number, metavar="N", help="pictures in the strip (default: 8)")
     add("--json", dest="json_file", metavar="OUT", help="write the numbers as JSON; -: print them so")
+    _add_quiet(parser)
     parser.set_defaults(run=_gait, parser=parser)
 
 
@@ -409,7 +425,7 @@ def _add_plot(commands: Any) -> None:
         epilog=_PLOT_EXAMPLES,
     )
     add = partial(parser.add_argument, default=argparse.SUPPRESS)
-    add("runs", nargs="*", metavar="RUN", help="run folders, or folders of TensorBoard logs (default: looked for by -a, -e)")
+    add("runs", nargs="*", metavar="RUN", help="run folders, TensorBoard logs (default: looked for by -a, -e)")
     add("-a", "--algo", nargs="+", metavar="ALGO", help="algorithms (default: all)")
     add("-e", "--env", nargs="+", metavar="ID", help="environments (default: all)")
     add("-f", "--folder", metavar="DIR", help="where runs are kept (default: logs)")
@@ -422,8 +438,9 @@ def _add_plot(commands: Any) -> None:
     add("--mean-per", type=_whole_number, metavar="N", help="instead of it, one point for every N episodes: their mean")
     add("-max", "--max-timesteps", type=_whole_number, metavar="N", help="leave out what came after N environment steps")
     add("-l", "--labels", nargs="+", metavar="LABEL", help="names of the curves, in their order")
-    add("-o", "--output", metavar="FILE", help=".png, .svg or .pdf (default: in the run's folder, or beside the runs)")
+    add("-o", "--output", metavar="FILE", help=".png, .svg or .pdf (default: in the run's folder, or beside runs)")
     add("--json", dest="json_file", metavar="FILE", help="write the numbers of the curves as JSON; -: print them so")
+    _add_quiet(parser)
     parser.set_defaults(run=_plot, parser=parser)
 
 
@@ -463,15 +480,16 @@ def _add_tune(commands: Any) -> None:
     add("--pruner", choices=("median", "halving", "hyperband", "none"), help=f"(default: {default.pruner})")
     add("--space", metavar="FILE", help="YAML file of the search space (default: shipped)")
     add("-params", "--hyperparams", nargs="+", metavar="K:V", help="fix hyper-parameters; values are YAML")
-    add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset with all that is not searched (default: shipped)")
+    add("-conf", "--conf-file", metavar="FILE", help="YAML file or preset, all that is not searched (default: shipped)")
     add("--env-kwargs", nargs="+", metavar="K:V", help="arguments of the environment")
     add("-f", "--log-folder", metavar="DIR", help=f"where files are kept (default: {default.log_folder})")
-    add("--storage", metavar="WHERE", help="journal file or postgresql:// URL (default: a journal with the files)")
+    add("--storage", metavar="WHERE", help="journal file or postgresql:// URL (default: with the files)")
     add("--study-name", metavar="NAME", help="name of the study (default: <algo>-<env>)")
     add("--heartbeat", type=_whole_number, metavar="S", help=f"seconds between signs of life (default: {default.heartbeat})")
     add("--device", help=f"auto, cpu or cuda (default: {default.device})")
     add("--num-threads", type=_whole_number, metavar="N", help="threads of each training (default: share of the cores)")
     add("--show", action="store_true", help="only print what a study has found so far, and write its files")
+    _add_quiet(parser)
     parser.set_defaults(run=_tune, parser=parser)
 
 
@@ -494,8 +512,7 @@ def _add_bench(commands: Any) -> None:
         "bench",
         help="train a grid of algorithms, environments and seeds, and compare them",
         usage="%(prog)s STUDY.yml [options]",
-        description="Train all cells of a study that are not done yet, each in a process of its own; then write tables and "
-        "figures.",
+        description="Train all cells of a study that are not done yet, several at a time; write tables and figures.",
         epilog=_BENCH_EXAMPLES,
     )
     parser.add_argument("study", metavar="STUDY.yml", help="algorithms, environments and seeds, see docs/command-line.md")
@@ -508,6 +525,7 @@ def _add_bench(commands: Any) -> None:
     add("-f", "--folder", metavar="DIR", help="where results are kept (default: logs/bench/<study>)")
     add("--report", action="store_true", help="only write tables and figures")
     add("--dry-run", action="store_true", help="only show the cells and how far they are")
+    _add_quiet(parser)
     parser.set_defaults(run=_bench, parser=parser)
 
 
@@ -577,7 +595,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown:
         parser.unknown(unknown[0])
     try:
-        return run(arguments, argv)
+        if not arguments.pop("silent", False):
+            return run(arguments, argv)
+        if parser.takes("--progress"):
+            arguments["progress"] = False
+        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+            return run(arguments, argv)
     except ConfigError as error:
         print(f"sb3-symphony {command}: error: {error}", file=sys.stderr)
         return 2
