@@ -5,7 +5,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import nullcontext, redirect_stdout
 from functools import partial
 from typing import Any, NoReturn
 
@@ -289,7 +289,8 @@ def _evaluate(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     from sb3_symphony.experiment.evaluate import evaluate
 
     result = evaluate(options)
-    print(result.as_json() if options.json_file == "-" else result)
+    if options.json_file != "-":
+        print(result)
     return 0
 
 
@@ -599,7 +600,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return run(arguments, argv)
         if parser.takes("--progress"):
             arguments["progress"] = False
-        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+        wanted = arguments.get("json_file") == "-"
+        with open(os.devnull, "w") as nowhere, nullcontext() if wanted else redirect_stdout(nowhere):
             return run(arguments, argv)
     except ConfigError as error:
         print(f"sb3-symphony {command}: error: {error}", file=sys.stderr)

@@ -87,7 +87,7 @@ def test_results_do_not_depend_on_the_number_of_processes(walker):
 def test_numbers(pendulum, folder):
     result = evaluate(EvaluateOptions(**pendulum, n_episodes=8, seed=0, json_file="out.json"))
     values = json.loads((folder / "out.json").read_text())
-    assert values == json.loads(result.as_json())
+    assert values == result.as_dict()
     returns = [episode.reward for episode in result.episodes]
     assert values["returns"] == returns and values["lengths"] == [200] * 8
     assert values["mean_reward"] == pytest.approx(np.mean(returns))
@@ -117,6 +117,9 @@ def test_command(pendulum, folder, capsys):
     other = json.loads(capsys.readouterr().out)
     assert (other["deterministic"], other["obs_noise"], other["action_delay"]) == (False, 0.1, 3)
     assert other["returns"] != values["returns"]
+    assert main([*argv, "--quiet"]) == 0 and capsys.readouterr().out == ""
+    assert json.loads((folder / "out.json").read_text()) == values
+    assert main([*argv[:-1], "-", "--quiet"]) == 0 and json.loads(capsys.readouterr().out) == values
 
 
 def test_old_model_from_the_command_line(capsys):

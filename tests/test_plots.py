@@ -200,8 +200,9 @@ def test_scalars(logs, figures, capsys):
     np.testing.assert_allclose(lines(figures[1].axes[0])[0][0][1], returns_of(logs, 1), rtol=1e-6)
 
 
-def test_numbers_as_json(logs):
-    assert main(["plot", "-e", "X-v0", "-w", "1", "--json", "curves.json"]) == 0
+def test_numbers_as_json(logs, capsys):
+    assert main(["plot", "-e", "X-v0", "-w", "1", "--json", "curves.json", "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
     content = json.loads((logs.parent / "curves.json").read_text())
     sac, td3 = content["panels"]["X-v0"]
     assert (content["x"], sac["label"], td3["y"]) == ("steps", "sac", list(range(30)))

@@ -215,7 +215,7 @@ class TrainOptions(BaseModel):
     verbose: int | None = Field(default=None, ge=0, le=2)
     progress: bool | None = None
     quiet: bool = False
-    json_file: str | None = None  # "-": none, whoever asks prints it
+    json_file: str | None = None
 
     @field_validator("n_timesteps")
     @classmethod

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import json
 import multiprocessing
 import signal
 from collections.abc import Iterator
@@ -18,7 +17,7 @@ from rich.progress import track
 from sb3_symphony.analysis.statistics import summarise
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.environment import Wrappers
-from sb3_symphony.experiment.output import output_file, write_output
+from sb3_symphony.experiment.output import report
 from sb3_symphony.experiment.robustness import ActionDelay, ObservationNoise
 from sb3_symphony.experiment.select import EvaluateOptions, Selection
 
@@ -74,10 +73,6 @@ class Evaluation:
             "lengths": [episode.length for episode in self.episodes],
         }
 
-    def as_json(self) -> str:
-        """:return: :meth:`as_dict` as text"""
-        return json.dumps(self.as_dict(), indent=2) + "\n"
-
     def __str__(self) -> str:
         result, options = self.as_dict(), self.options
         n = len(self.episodes)
@@ -105,19 +100,18 @@ def evaluate(options: EvaluateOptions) -> Evaluation:
     Play episodes with a trained agent. Each depends on its seed alone, not on ``n_envs`` or the episodes before it.
 
     :param options: which agent, how many episodes, under which conditions
-    :return: the episodes and their statistics; written as JSON too, if the options name a file
+    :return: the episodes and their statistics; also written or printed as JSON, if the options say so
     :raises ConfigError: if something is missing or damaged, does not fit, or cannot be written
     """
-    target = None if options.json_file in (None, "-") else output_file(options.json_file, "--json")
-    with _open(options) as agent:  # here too with several processes: mistakes are found before they start
+    # Opened here too with several processes: mistakes are found before they start
+    with report(options.json_file) as tell, _open(options) as agent:
         seeds = range(options.seed, options.seed + options.n_episodes)
         played = _in_processes(options, seeds) if min(options.n_envs, len(seeds)) > 1 else _in_turn(agent, options, seeds)
         bar = partial(
             track, description="episodes", console=Console(stderr=True), transient=True, disable=not options.progress
         )
         result = Evaluation(agent.selection, options, list(bar(played, total=len(seeds))))
-    if target is not None:
-        write_output(target, result.as_json().encode(), "--json")
+        tell(result.as_dict())
     return result
 
 

@@ -1,6 +1,5 @@
 """How trained agents walk: sensors on BipedalWalker, for the numbers and the figure of :mod:`sb3_symphony.analysis.gait`."""
 
-import json
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -15,7 +14,7 @@ from rich.progress import track
 from sb3_symphony.analysis.gait import GaitNumbers, Recording, gait_numbers, plot_gait
 from sb3_symphony.analysis.style import SUFFIXES
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file, write_output
+from sb3_symphony.experiment.output import output_file, report
 from sb3_symphony.experiment.select import GaitOptions
 from sb3_symphony.experiment.video import Camera, Shown, show_agents
 
@@ -203,19 +202,17 @@ def gait(options: GaitOptions) -> list[Gait]:
     :return: how each of them walked; numbers are printed, and the figure is written
     :raises ConfigError: if an agent cannot be opened, is no walker, falls at once, or a file cannot be written
     """
-    with ExitStack() as cleanup:
+    with report(options.json_file) as tell, ExitStack() as cleanup:
         agents = show_agents(options, cleanup, WalkerSensors)
         run = agents[0].agent.selection.run
         default = run / "gait.png" if run is not None and len(agents) == 1 else Path("gait.png")
         output = output_file(options.output or default, "--output", SUFFIXES)
-        json_file = None if options.json_file in (None, "-") else output_file(options.json_file, "--json")
         gaits = [record_gait(shown, options) for shown in agents]
-    plain = json.dumps([gait.plain() for gait in gaits], indent=2) + "\n"
-    try:
-        plot_gait([gait.shown for gait in gaits], [gait.numbers for gait in gaits], output)
-    except OSError as error:
-        raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror or error}") from None
-    if json_file is not None:
-        write_output(json_file, plain.encode(), "--json")
-    print(plain if options.json_file == "-" else f"{_table(gaits)}\n{output}", end="" if options.json_file == "-" else "\n")
+        try:
+            plot_gait([gait.shown for gait in gaits], [gait.numbers for gait in gaits], output)
+        except OSError as error:
+            raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror or error}") from None
+        tell([gait.plain() for gait in gaits])
+    if options.json_file != "-":
+        print(f"{_table(gaits)}\n{output}")
     return gaits

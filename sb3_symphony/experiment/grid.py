@@ -330,7 +330,7 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
             new = not folder.exists()
             with _alone(output_folder(folder, "-f")):
                 session = _new_session(backend, folder, new)
-                interrupted = _search(study, progress, options, folder)
+                interrupted = _search(study, progress, options, path, folder)
                 progress = _standings(study, path, folder)  # some had to wait for their settings
                 _write_settings(progress, folder, path)
                 while not interrupted and (ready := _ready(progress)):
@@ -352,7 +352,7 @@ def _ready(progress: Sequence[Progress]) -> list[Progress]:
     return [each for each in queued if each.cell.start_from is None or each.cell.start_from.name in done]
 
 
-def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, folder: Path) -> bool:
+def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, path: Path, folder: Path) -> bool:
     """
     Search for the settings that cells wait for.
 
@@ -363,7 +363,7 @@ def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, f
     cores = options.n_jobs or os.cpu_count() or 1
     wanted = {each.cell.sweep.parent.name for each in progress if each.cell.sweep is not None and not each.kept}
     for name in (name for name in study.sweeps if name in wanted):
-        sweep = sweep_options(study, name, folder)
+        sweep = sweep_options(study, name, path.absolute().parent, folder)
         n_jobs = max(1, cores // sweep.seeds_per_trial)
         result = tune(sweep.model_copy(update={"n_jobs": n_jobs}))
         print(result.summary, flush=True)

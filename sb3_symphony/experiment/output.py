@@ -79,7 +79,7 @@ def report(name: str | None) -> Iterator[Callable[[Any], None]]:
     """
     For a command with ``--json``: looks whether the file could be written before the work begins.
 
-    :param name: the file; ``-`` for the terminal, None for nothing
+    :param name: the file; ``-`` for the terminal, where nothing else should be printed then; None for nothing
     :return: what to give the plain values to
     :raises ConfigError: if the file cannot be written
     """

@@ -1,6 +1,5 @@
 """What ``sb3-symphony plot`` draws: from options of the command line to runs, their curves, and an image."""
 
-import json
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -11,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file
+from sb3_symphony.experiment.output import output_file, report
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.plots import Curve, Line
@@ -57,32 +56,26 @@ def plot(options: PlotOptions, groups: "list[Group] | None" = None) -> Path:
     from sb3_symphony.analysis import plots, style
 
     _check(options)
-    try:
-        groups = _groups(options) if groups is None else groups
-        output = Path(options.output or _default_output(options, groups))
-        style.check_suffix(output)
-        output_file(options.output or output, "--output")
-        if options.json_file not in (None, "-"):
-            output_file(str(options.json_file), "--json")
-        panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-    except OSError as error:
-        raise ConfigError(f"'{error.filename}' cannot be read — {error.strerror}") from None
-    try:
-        if options.kind == "scalars":
-            title = ", ".join(dict.fromkeys(group.env for group in groups))
-            plots.plot_scalars(panels, options.x_axis, output, title)
-        else:
-            plots.plot_curves(panels, options.x_axis, options.y_axis, _smoothed(options), output)
-        if options.json_file:
-            content = {"x": options.x_axis, "panels": {k: [c.plain() for c in v] for k, v in panels.items()}}
-            if options.json_file == "-":
-                print(json.dumps(content))
+    with report(options.json_file) as tell:
+        try:
+            groups = _groups(options) if groups is None else groups
+            output = Path(options.output or _default_output(options, groups))
+            style.check_suffix(output)
+            output_file(options.output or output, "--output")
+            panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        except OSError as error:
+            raise ConfigError(f"'{error.filename}' cannot be read — {error.strerror}") from None
+        try:
+            if options.kind == "scalars":
+                title = ", ".join(dict.fromkeys(group.env for group in groups))
+                plots.plot_scalars(panels, options.x_axis, output, title)
             else:
-                Path(options.json_file).write_text(json.dumps(content) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"'{error.filename}' cannot be written — {error.strerror}") from None
+                plots.plot_curves(panels, options.x_axis, options.y_axis, _smoothed(options), output)
+        except OSError as error:
+            raise ConfigError(f"'{error.filename}' cannot be written — {error.strerror}") from None
+        tell({"x": options.x_axis, "panels": {title: [curve.plain() for curve in panel] for title, panel in panels.items()}})
     return output
 
 

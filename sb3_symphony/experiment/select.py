@@ -281,7 +281,7 @@ class EvaluateOptions(SelectOptions):
     n_envs: int = Field(default=1, ge=1)
     obs_noise: FiniteFloat = Field(default=0.0, ge=0)
     action_delay: int = Field(default=0, ge=0)
-    json_file: str | None = None  # "-": none, whoever asks prints it
+    json_file: str | None = None
     progress: bool = False
     num_threads: int = 1  # one observation at a time is fastest so, and results do not depend on the machine's cores
 

@@ -32,7 +32,7 @@ from sb3_symphony.experiment.config import (
 from sb3_symphony.experiment.plot import PlotOptions
 from sb3_symphony.experiment.registry import is_file
 from sb3_symphony.experiment.run_folder import RunFolder
-from sb3_symphony.experiment.space import TuneOptions
+from sb3_symphony.experiment.space import TuneOptions, read_space
 
 
 def _part(model: type[BaseModel], name: str | None, value: Any) -> Any:
@@ -368,9 +368,11 @@ def read_study(path: Path, quick: bool = False, only: Sequence[str] = ()) -> Stu
 def _check(study: Study, folder: Path) -> None:
     for algorithm in study.algorithms:
         check_algorithm(_algo(algorithm, folder))
-    for name, sweep in study.sweeps.items():
+    for name in study.sweeps:
         try:
-            check_algorithm(sweep.algo)
+            sweep = sweep_options(study, name, folder, folder)
+            load_config(sweep.training(sweep.hyperparams))
+            read_space(sweep)
         except ConfigError as error:
             raise ConfigError(f"sweeps: {name}: {error}") from None
     _check_twice("algorithms", [algorithm.name.lower() for algorithm in study.algorithms])  # folders, on any disk
@@ -509,28 +511,34 @@ def _cell(study: Study, algorithm: Algorithm, environment: Environment, seed: in
     conditions = {} if matrix is None else {name: each.model_dump() for name, each in matrix.conditions.items()}
     sweep = None
     if algorithm.sweep is not None:
-        sweep = sweep_options(study, algorithm.sweep, results).folder / "best.yml"
+        sweep = sweep_options(study, algorithm.sweep, folder, results).folder / "best.yml"
     options = _options(study, algorithm, environment, seed, folder, sweep)
     return Cell(algorithm.name, environment, seed, options, study.final_episodes, conditions, sweep=sweep)
 
 
-def sweep_options(study: Study, name: str, results: Path) -> TuneOptions:
+def sweep_options(study: Study, name: str, folder: Path, results: Path) -> TuneOptions:
     """
     :param study: a study
     :param name: name of one of its searches
+    :param folder: folder of the study file, which the search's own files are relative to
     :param results: folder of its results
     :return: options of ``tune``
     """
     settled = {"log_folder": str(results / "sweeps"), "study_name": name, "device": study.device, "num_threads": 1}
-    return study.sweeps[name].model_copy(update=settled)
+    sweep = study.sweeps[name]
+    space = None if sweep.space is None else str(folder / sweep.space)
+    return sweep.model_copy(update={**settled, "conf_file": _conf(sweep.conf_file, folder), "space": space})
+
+
+def _conf(name: str | None, folder: Path) -> str | None:
+    """A file beside the study with its whole path; names of shipped files stay as they are."""
+    return name if name is None or shipped_file(name) is not None else str(folder / name)
 
 
 def _options(
     study: Study, algorithm: Algorithm, environment: Environment, seed: int, folder: Path, sweep: Path | None
 ) -> TrainOptions:
-    conf = algorithm.conf
-    if conf is not None and shipped_file(conf) is None:
-        conf = str(folder / conf)
+    conf = _conf(algorithm.conf, folder)
     if sweep is not None and sweep.is_file():
         conf = str(sweep)
     if study.protocol == "standard":
