@@ -1,6 +1,7 @@
 """Films: what is in them, and how long they are."""
 
 import math
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +10,9 @@ from PIL import Image
 from stable_baselines3 import TD3
 
 from sb3_symphony.cli import main
-from sb3_symphony.experiment.video import _Moment, labelled, sampled, side_by_side, write_film
+from sb3_symphony.experiment.config import run_settings
+from sb3_symphony.experiment.select import Selection
+from sb3_symphony.experiment.video import _labels, _Moment, labelled, sampled, side_by_side, write_film
 
 read_frames = pytest.importorskip("imageio_ffmpeg").read_frames
 
@@ -162,6 +165,21 @@ def test_grid(model):
     film, _ = film_of("Counter-v0_grid.mp4")
     assert film.shape[2] == 204
     np.testing.assert_allclose(greys(film), greys(film, left=104), atol=0.2)
+
+
+def test_names_of_agents():
+    def names(*models, run=True):
+        settings = run_settings({"n_timesteps": 1})
+        paths = [Path(model) for model in models]
+        selections = [Selection("redq", path, "A-v0", settings, None, path.parent if run else None) for path in paths]
+        return _labels(selections)
+
+    assert names("x/A-v0_1/best_model.zip") == ["redq best"]
+    assert names("x/A-v0_1/best_model.zip", "x/A-v0_1/rl_model_4000_steps.zip") == ["redq best", "redq 4k steps"]
+    assert names("x/A-v0_1/A-v0.zip", "x/A-v0_2/A-v0.zip") == ["redq (A-v0_1)", "redq (A-v0_2)"]
+    assert names("x/redq/A-v0_1/A-v0.zip", "y/redq/A-v0_1/A-v0.zip") == ["redq (x/redq/A-v0_1)", "redq (y/redq/A-v0_1)"]
+    assert names("a.zip", "b.zip", run=False) == ["redq (a)", "redq (b)"]
+    assert names("a.zip", "a.zip", run=False) == ["redq", "redq"]
 
 
 def test_who_has_finished_waits(model, monkeypatch):

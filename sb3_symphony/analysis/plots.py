@@ -245,7 +245,7 @@ def _name(curve: Curve) -> str:
 
 def _scale_x(axes: Axes, x: XAxis) -> None:
     """Label, unit and limits of the x axis. Curves hold seconds; the ticks say hours, minutes or seconds."""
-    axes.margins(x=0.01)
+    axes.margins(x=0.02)  # room for half a marker
     axes.set_xlim(left=0)
     if x == "time":
         right = axes.get_xlim()[1]

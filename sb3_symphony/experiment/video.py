@@ -92,7 +92,7 @@ class Shown:
 
 
 def _labels(selections: Sequence[Selection]) -> list[str]:
-    """Algorithm and which of a run's models; environment and run only where they differ: ``redq``, ``redq 4k steps``."""
+    """Algorithm and which of a run's models, environment and folder only where they differ: ``redq``, ``redq 4k steps``."""
     labels = []
     for selection in selections:
         label, steps = selection.algo, re.fullmatch(r"rl_model_(\d+)_steps", selection.model.stem)
@@ -105,8 +105,12 @@ def _labels(selections: Sequence[Selection]) -> list[str]:
         labels.append(label)
     if len(set(labels)) == len(labels):
         return labels
-    origins = [selection.run.name if selection.run else selection.model.stem for selection in selections]
-    return [f"{label} ({origin})" for label, origin in zip(labels, origins, strict=True)]
+    paths = [(selection.run or selection.model.with_suffix("")).absolute().parts for selection in selections]
+    for depth in range(1, max(map(len, paths))):  # as little of the paths as tells them apart
+        named = [f"{label} ({'/'.join(path[-depth:])})" for label, path in zip(labels, paths, strict=True)]
+        if len(set(named)) == len(named):
+            return named
+    return labels  # one agent several times
 
 
 @contextmanager
