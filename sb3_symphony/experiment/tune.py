@@ -14,6 +14,7 @@ import time
 import warnings
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import timedelta
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -173,6 +174,7 @@ class Sweep:
         self._others = 0  # trials of other processes that had not ended when nothing was left to claim
         self._claim_at = 0.0
         self._ends_at = time.monotonic() + (self.options.timeout or float("inf"))
+        self._began, self._ended_before = time.monotonic(), self._ended(study.get_trials(deepcopy=False))
 
     def run(self) -> None:
         """
@@ -364,9 +366,16 @@ class Sweep:
 
     def _progress(self) -> str:
         trials = self.study.get_trials(deepcopy=False)
-        ended = sum(trial.state.is_finished() for trial in trials) - len(replaced(trials))
-        best = best_of(trials)
-        return f"{ended} of {self.options.n_trials}" + (f", best {best.value:.2f} (trial {best.number})" if best else "")
+        ended, best, n_trials = self._ended(trials), best_of(trials), self.options.n_trials
+        told = [f"{ended} of {n_trials}"]
+        if self._ended_before < ended < n_trials:  # of all processes together
+            each = (time.monotonic() - self._began) / (ended - self._ended_before)
+            told.append(f"about {timedelta(seconds=round(each * (n_trials - ended)))} left")
+        return ", ".join([*told, *([f"best {best.value:.2f} (trial {best.number})"] if best else [])])
+
+    @staticmethod
+    def _ended(trials: list[FrozenTrial]) -> int:
+        return sum(trial.state.is_finished() for trial in trials) - len(replaced(trials))
 
 
 def _words(told: FrozenTrial, attributes: dict[str, Any]) -> str:
