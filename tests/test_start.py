@@ -174,7 +174,8 @@ def rewards_of(run):
 
 
 def test_experience_saved_by_sb3(folder):
-    first = train(options()).run
+    """It goes before that of checkpoints."""
+    first = train(options(save_freq=60)).run
     model = TD3.load(first.model, env=gym.make("Pendulum-v1"), learning_starts=10)
     model.learn(40)
     model.save_replay_buffer(first.path / "replay_buffer.pkl")
