@@ -1,10 +1,14 @@
 """Study files: what their cells are, and one clear line for every mistake."""
 
+from pathlib import Path
+
 import pytest
 import yaml
 
+from sb3_symphony.cli import main
 from sb3_symphony.experiment.config import ConfigError, shipped_folder
-from sb3_symphony.experiment.study import cells_of, configuration, read_study
+from sb3_symphony.experiment.select import EvaluateOptions
+from sb3_symphony.experiment.study import cells_of, configuration, read_study, sweep_options
 
 SMALL = {
     "algorithms": ["td3", {"name": "sac-small", "algo": "sac", "overrides": {"policy_kwargs.net_arch": [8]}, "steps": 70}],
@@ -132,6 +136,134 @@ def test_mistakes_of_the_quick_version(write, quick, message):
     with pytest.raises(ConfigError) as error:
         read_study(path, quick=True)
     assert message in str(error.value)
+
+
+WALKER = "BipedalWalker-v3"
+
+
+def test_seeds_and_environments_of_an_algorithm(write, tmp_path):
+    algorithms = [{"name": "td3", "seeds": [7, 8, 9]}, {"name": "sac", "environments": [WALKER]}]
+    environments = ["Pendulum-v1", {"id": WALKER, "overrides": {"gamma": 0.5, "tau": 0.1}}]
+    algorithms[1]["overrides"] = {"gamma": 0.6}
+    cells = cells_of(read_study(write(algorithms=algorithms, environments=environments)), tmp_path)
+    assert [cell.name for cell in cells] == [
+        *("td3/Pendulum-v1_7", "td3/BipedalWalker-v3_7", "sac/BipedalWalker-v3_0"),
+        *("td3/Pendulum-v1_8", "td3/BipedalWalker-v3_8", "sac/BipedalWalker-v3_1"),
+        *("td3/Pendulum-v1_9", "td3/BipedalWalker-v3_9"),
+    ]
+    td3, sac = configuration(cells[1]).arguments, configuration(cells[2]).arguments
+    assert (td3["gamma"], td3["tau"], sac["gamma"], sac["tau"]) == (0.5, 0.1, 0.6, 0.1)
+    assert "tau" not in configuration(cells[0]).arguments
+
+
+def test_start_from_another_cell(write, tmp_path):
+    algorithms = [
+        {"name": "base", "algo": "td3", "environments": ["Pendulum-v1"], "overrides": {"policy_kwargs.net_arch": [8]}},
+        {"name": "onward", "algo": "td3", "environments": [WALKER]},
+    ]
+    algorithms[1]["start_from"] = {"algorithm": "base", "environment": "Pendulum-v1", "replay_buffer": True}
+    path = write(algorithms=algorithms)
+    cells = cells_of(read_study(path), tmp_path)
+    assert [cell.name for cell in cells] == [
+        *("base/Pendulum-v1_0", "base/Pendulum-v1_1", "onward/BipedalWalker-v3_0", "onward/BipedalWalker-v3_1")
+    ]
+    assert [cell.start_from and cell.start_from.name for cell in cells] == [None, None, cells[0].name, cells[1].name]
+    assert cells[2].options.with_replay_buffer
+    assert configuration(cells[2]).plain["policy_kwargs"] == {"net_arch": [8]}  # networks are those it starts from
+    kept = read_study(path, only=["onward"])
+    assert [each.name for each in kept.algorithms] == ["base", "onward"]
+    assert [each.name for each in read_study(path, only=["base"]).algorithms] == ["base"]
+
+
+def test_sweeps_conditions_and_figures(write, tmp_path):
+    (tmp_path / "fixed.yml").write_text("n_timesteps: 99\ngamma: 0.3\n")
+    wrapper = "gymnasium.wrappers.TimeLimit"
+    study = read_study(
+        write(
+            algorithms=[{"name": "found", "algo": "td3", "sweep": "s"}],
+            sweeps={"s": {"algo": "td3", "env": "Pendulum-v1", "conf_file": "fixed.yml", "n_trials": 3}},
+            matrix={"label": "delay", "conditions": {1: {"action_delay": 1}, "short": {"env_wrapper": {wrapper: {"a": 1}}}}},
+            figures={"reward": {"x_axis": "episodes", "algorithms": ["found"]}},
+            quick={"sweeps": {"n_trials": 1}, "seeds": 1},
+        )
+    )
+    cell = cells_of(study, tmp_path, tmp_path / "results")[0]
+    assert cell.waits and cell.sweep == tmp_path / "results" / "sweeps" / "td3" / "tune" / "s" / "best.yml"
+    assert configuration(cell).settings.n_timesteps == 60
+    assert cell.conditions["1"]["action_delay"] == 1
+    assert EvaluateOptions(**cell.conditions["short"]).env_wrapper == [(wrapper, {"a": 1})]
+    options = sweep_options(study, "s", tmp_path, tmp_path / "results")
+    assert (options.conf_file, options.n_trials, options.name) == (str(tmp_path / "fixed.yml"), 3, "s")
+    assert read_study(tmp_path / "study.yml", quick=True).sweeps["s"].n_trials == 1
+    cell.sweep.parent.mkdir(parents=True)
+    cell.sweep.write_text("n_timesteps: 5\ngamma: 0.7\n")
+    found = cells_of(study, tmp_path, tmp_path / "results")[0]
+    assert not found.waits and configuration(found).arguments == {"gamma": 0.7}
+
+
+def test_algorithms_of_a_file(write, tmp_path):
+    (tmp_path / "mine.py").write_text("raise RuntimeError('nobody reads it yet')")
+    path = write(algorithms=[{"name": "own", "algo": "mine.py:Own", "conf": "td3"}])
+    cell = cells_of(read_study(path), tmp_path)[0]
+    assert cell.options.algo == f"{tmp_path}/mine.py:Own"
+    assert configuration(cell).settings.n_timesteps == 60
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"algorithms": [{"name": "own", "algo": "mine.py:Own"}]}, "unknown algorithm"),
+        (
+            {"algorithms": [{"name": "td3", "environments": ["Pendulm-v1"]}]},
+            "environments: unknown name 'Pendulm-v1': did you",
+        ),
+        ({"algorithms": [{"name": "td3", "seeds": [1, 1]}]}, "td3: seeds: 1 is there 2 times"),
+        ({"algorithms": [{"name": "td3", "sweep": "s"}]}, "sweep: unknown name 's' — expected some of those before"),
+        ({"algorithms": [{"name": "td3", "sweep": "s", "conf": "x"}]}, "td3: conf and sweep: expected only one of them"),
+        (
+            {"algorithms": [{"name": "td3", "start_from": {"algorithm": "td3", "environment": WALKER}}]},
+            "start_from: unknown name 'td3' — expected some of those before",
+        ),
+        (
+            {"algorithms": ["td3", {"name": "b", "algo": "td3", "start_from": {"algorithm": "td3", "environment": "X"}}]},
+            "start_from: unknown name 'X'",
+        ),
+        (
+            {
+                "algorithms": [
+                    {"name": "td3", "seeds": [5]},
+                    {"name": "b", "algo": "td3", "start_from": {"algorithm": "td3", "environment": WALKER}},
+                ]
+            },
+            "start_from: td3 has no seed 0",
+        ),
+        ({"sweeps": {"s": {"algo": "tdd3"}}}, "sweeps: s: unknown algorithm 'tdd3'"),
+        ({"sweeps": {"s": {"algo": "td3", "n_jobs": 2}}}, "sweeps: 'n_jobs' — is for the command line"),
+        ({"sweeps": {"s": {"algo": "td3", "n_trails": 2}}}, "sweeps: unknown option 'n_trails': did you mean 'n_trials'?"),
+        ({"matrix": {"label": "x", "conditions": {}}}, "matrix: conditions: {} — expected a mapping"),
+        ({"matrix": {"label": "x", "conditions": {"a": {"mass": 3}}}}, "unknown option 'mass'"),
+        ({"figures": {"training": {}}}, "figures: 'training' — expected letters"),
+        ({"figures": {"x": {"algorithms": ["td4"]}}}, "figures: x: algorithms: unknown name 'td4': did you mean 'td3'?"),
+        ({"figures": {"x": {"x_axis": "days"}}}, "x_axis: 'days'"),
+    ],
+)
+def test_mistakes_of_what_goes_beyond_a_grid(write, changes, message):
+    with pytest.raises(ConfigError) as error:
+        read_study(write(**changes))
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+STUDIES = sorted((Path(__file__).parents[1] / "benchmarks" / "studies").glob("*/study.yml"))
+
+
+@pytest.mark.parametrize("quick", [False, True], ids=["full", "quick"])
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.parent.name)
+def test_shipped_studies(path, quick, tmp_path, capsys):
+    if "Hopper" in path.read_text():
+        pytest.importorskip("mujoco")
+    assert main(["bench", str(path), "--dry-run", "-f", str(tmp_path / "results"), *["--quick"] * quick]) == 0
+    assert " queued" in capsys.readouterr().out.splitlines()[-1]
+    assert not (tmp_path / "results").exists()
 
 
 def test_no_study_file(tmp_path):

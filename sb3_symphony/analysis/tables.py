@@ -371,10 +371,29 @@ def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     )
     other = sorted({_protocol(each.run) for each in results if each.run is not None and not each.standard})
     lines += [f"- non-standard: {protocol}" for protocol in other]
+    lines += _repeated(results)
     missing = [f"{each.algorithm} {each.seed}" for each in results if each.summary is None]
     if missing:
         lines.append(f"- not done, and not in these numbers: {', '.join(missing)}")
     return lines
+
+
+def _repeated(results: Sequence[Result]) -> Iterator[str]:
+    """Whether runs of the same settings and seed, under two names, are the same."""
+    done = [each for each in results if each.summary is not None and each.run is not None and each.run.config]
+    for i, first in enumerate(done):
+        for second in done[i + 1 :]:
+            a, b = first.run, second.run
+            assert a is not None and b is not None
+            if (a.algo, a.config, first.seed) == (b.algo, b.config, second.seed):
+                same = "bit for bit the same" if _episodes_of(first) == _episodes_of(second) else "not the same"
+                both = f"{first.algorithm} and {second.algorithm}"
+                yield f"- {both}: same settings; returns and lengths of all episodes with seed {first.seed} are {same}"
+
+
+def _episodes_of(result: Result) -> list[tuple[Any, ...]]:
+    """Of training and of all evaluations."""
+    return [tuple(row[name] for name in EPISODE_COLUMNS[3:]) for row in episode_rows([result])]
 
 
 def _protocol(run: Run) -> str:

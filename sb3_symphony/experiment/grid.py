@@ -30,7 +30,7 @@ from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions,
 from sb3_symphony.experiment.registry import is_file, without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.signals import handled_by
-from sb3_symphony.experiment.study import Cell, Environment, Study, cells_of, configuration, read_study, sweep_options
+from sb3_symphony.experiment.study import Cell, Drawing, Environment, Study, cells_of, configuration, read_study, sweep_options
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.tables import Result
@@ -163,6 +163,7 @@ def bench(options: BenchOptions) -> BenchResult:
     if options.dry_run:
         from sb3_symphony.experiment.grid_view import plain_table
 
+        _check_models([each for each in progress if not each.kept])
         return BenchResult(folder, plain_table(progress), untouched=True)
     if options.report:
         if not any(each.run.path.is_dir() for each in progress):
@@ -582,18 +583,46 @@ def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
 
 def _draw_figures(study: Study, results: Sequence["Result"], folder: Path) -> None:
     """The study's own figures, of what there is to draw: a figure whose runs have not recorded it stays as it is."""
+    for name, figure in study.figures.items():
+        own = [
+            each
+            for each in results
+            if each.run is not None
+            and each.algorithm in (figure.algorithms or [each.algorithm])
+            and each.environment in (figure.environments or [each.environment])
+        ]
+        try:
+            (_draw_curves if figure.gait_at is None else _draw_gaits)(figure, own, folder / f"{name}.png")
+        except ConfigError as error:
+            print(f"{name}.png is not drawn: {error}", flush=True)
+
+
+def _draw_curves(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
     from sb3_symphony.analysis.runs import Group
     from sb3_symphony.experiment.plot import plot
 
-    for name, figure in study.figures.items():
-        groups: dict[tuple[str, str], Group] = {}
-        for each in results:
-            if each.run is None or each.algorithm not in (figure.algorithms or [each.algorithm]):
-                continue
-            if each.environment in (figure.environments or [each.environment]):
-                group = groups.setdefault((each.algorithm, each.environment), Group(each.algorithm, each.environment, []))
-                group.runs.append(each.run)
-        try:
-            plot(figure.model_copy(update={"output": str(folder / f"{name}.png")}), list(groups.values()))
-        except ConfigError as error:
-            print(f"{name}.png is not drawn: {error}", flush=True)
+    groups: dict[tuple[str, str], Group] = {}
+    for each in results:
+        assert each.run is not None
+        group = groups.setdefault((each.algorithm, each.environment), Group(each.algorithm, each.environment, []))
+        group.runs.append(each.run)
+    plot(figure.model_copy(update={"output": str(output)}), list(groups.values()))
+
+
+def _draw_gaits(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
+    from sb3_symphony.experiment.gait import gait
+    from sb3_symphony.experiment.select import GaitOptions, checkpoints
+
+    assert figure.gait_at is not None
+    agents: dict[str, Path] = {}
+    for each in results:
+        assert each.run is not None
+        saved = checkpoints(RunFolder(each.run.path, ""))
+        episodes = each.run.episodes
+        if each.algorithm not in agents and saved and episodes is not None and len(episodes.steps) >= figure.gait_at:
+            end = int(episodes.steps[figure.gait_at - 1])
+            agents[each.algorithm] = saved[min(saved, key=lambda steps: abs(steps - end))]
+    if not agents:
+        raise ConfigError(f"no run has {figure.gait_at} episodes and the models saved around the last of them")
+    models = list(map(str, agents.values()))
+    gait(GaitOptions(agents=models, labels=list(agents), output=str(output), json_file=str(output.with_suffix(".json"))))

@@ -264,10 +264,13 @@ class Drawing(PlotOptions):
 
     :param algorithms: names of algorithms, by default all
     :param environments: ids of environments, by default all
+    :param gait_at: draw instead how agents of the first seed walk, as ``gait`` does, by the models saved nearest to the end
+        of that training episode
     """
 
     algorithms: _List[str] | None = None
     environments: _List[str] | None = None
+    gait_at: int | None = Field(default=None, ge=1)
 
 
 class Study(BaseModel):
