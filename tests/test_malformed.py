@@ -121,8 +121,43 @@ COMMANDS = {
         "--json": NO_FILE | st.just("."),
         "--no-such-flag": st.none() | TEXT,
     },
+    "tune": {
+        "--algo": TEXT.filter(lambda text: text != "sac"),
+        "--env": NO_ENV,
+        "--n-timesteps": BAD_COUNT.filter(lambda text: text != "-1"),
+        "--n-trials": BAD_COUNT,
+        "--n-startup-trials": NO_NUMBER | st.integers(max_value=-1).map(str),
+        "--n-evaluations": BAD_COUNT | st.just("1000"),
+        "--eval-episodes": BAD_COUNT,
+        "--seed": BAD_COUNT.filter(lambda text: text not in ("0", "-0")) | st.just("2147483648"),
+        "--seeds-per-trial": BAD_COUNT,
+        "--n-jobs": NO_NUMBER | st.just("0") | st.integers(max_value=-2).map(str),
+        "--timeout": NO_NUMBER | st.floats(max_value=-1e-9).map(str),
+        "--sampler": TEXT.filter(lambda text: text not in ("tpe", "random", "gp", "cmaes")),
+        "--pruner": TEXT.filter(lambda text: text not in ("median", "halving", "hyperband", "none")),
+        "--space": NO_FILE | st.sampled_from(["sac.zip", ".", "", "logs"]),
+        "--hyperparams": SELECTION["--env-kwargs"],
+        "--conf-file": NO_FILE | st.sampled_from(["sac.zip", ".", "", "logs"]),
+        "--env-kwargs": SELECTION["--env-kwargs"],
+        "--log-folder": st.just("sac.zip") | st.just("sac.zip/logs") | st.just("x" * 300),
+        "--storage": st.sampled_from(["sac.zip/journal.log", "nothing://here", "."]),
+        "--heartbeat": BAD_COUNT,
+        "--device": SELECTION["--device"],
+        "--num-threads": NO_NUMBER,
+        "--show": st.none(),
+        "--no-such-flag": st.none() | TEXT,
+    },
+    "bench": {
+        "--n-jobs": BAD_COUNT,
+        "--backend": TEXT.filter(lambda text: text not in ("loky", "ray")),
+        "--algo": TEXT.filter(lambda text: text != "sac"),
+        "--no-such-flag": st.none() | TEXT,
+    },
     "export": SELECTION | {"--output": NO_FILE | st.sampled_from(["sac.zip", "actor", ".onnx/", "."])},
 }
+
+
+STUDY = {"algorithms": ["sac"], "environments": ["Pendulum-v1"], "seeds": 1, "steps": 100}
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +167,7 @@ def folder(tmp_path_factory):
     model.save(folder / "sac.zip")
     PPO("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}, device="cpu").save(folder / "ppo.zip")
     (folder / "garbage.zip").write_bytes(b"PK garbage")
+    (folder / "study.yml").write_text(yaml.safe_dump(STUDY))
     run = folder / "logs" / "sac" / "Pendulum-v1_1"
     (run / "Pendulum-v1").mkdir(parents=True)
     (run / "Pendulum-v1" / "config.yml").write_text("n_timesteps: 10\n")
@@ -168,6 +204,10 @@ def test_malformed_command_lines(folder, monkeypatch, command, data):
     if command == "train":
         # A slip of this test would train, shortly
         given_flags |= {"--n-timesteps": "1", "--eval-freq": "0", "--no-progress": None}
+    elif command == "tune":
+        given_flags |= {"--n-timesteps": "150", "--n-trials": "1", "--n-evaluations": "1", "--seeds-per-trial": "1"}
+    elif command == "bench":
+        given_flags = {"--dry-run": None}
     elif command != "plot":
         given_flags["--model"] = "sac.zip"
     if command == "enjoy":
@@ -177,7 +217,8 @@ def test_malformed_command_lines(folder, monkeypatch, command, data):
     if "--eval-env-kwargs" in given_flags:
         given_flags["--eval-freq"] = "1" if given_flags["--eval-freq"] == "0" else given_flags["--eval-freq"]
     # As --flag=value, which also takes values that look like flags
-    refused(folder, [command, *(flag if value is None else f"{flag}={value}" for flag, value in given_flags.items())])
+    flags = [flag if value is None else f"{flag}={value}" for flag, value in given_flags.items()]
+    refused(folder, [command, *flags, *["study.yml"] * (command == "bench")])
 
 
 #: plain values that YAML can hold
@@ -253,6 +294,32 @@ def test_malformed_configurations(folder, monkeypatch, data):
         pairs = [f"{name}:{json.dumps(value)}" for name, value in values.items()]
         argv += ["-n=1"] * ("n_timesteps" not in values) + ["-params", *pairs]
     refused(folder, argv)
+
+
+#: key of a study → values that are wrong
+STUDY_KEYS = {
+    "title": st.integers() | st.lists(TEXT),
+    "algorithms": TEXT | st.sampled_from([[], ["sacc"], [3], [{"algo": "sac"}], [{"name": "a", "algo": "b"}], ["sac", "sac"]]),
+    "environments": TEXT | st.sampled_from([[], ["Pendulum-v7"], [3], [{"threshold": 1}], [{"id": "CartPole-v1"}]]),
+    "seeds": NOT_A_COUNT.filter(lambda value: not isinstance(value, list)) | st.sampled_from([[], [-1], [1, 1], ["a"]]),
+    "steps": NOT_A_COUNT,
+    "protocol": TEXT.filter(lambda text: text != "standard") | st.sampled_from([{"eval_freq": -1}, {"episodes": 3}, 5]),
+    "final_episodes": NO_NUMBER | st.integers(max_value=-1),
+    "save_freq": NOT_A_COUNT,
+    "device": TEXT.map(lambda text: f"no {text}") | st.integers(),
+    "step": PLAIN,
+    "algorithm": PLAIN,
+}
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_malformed_studies(folder, monkeypatch, data):
+    monkeypatch.chdir(folder)
+    names = data.draw(st.lists(st.sampled_from(sorted(STUDY_KEYS)), min_size=1, max_size=2, unique=True))
+    study = STUDY | {name: data.draw(STUDY_KEYS[name]) for name in names}
+    (folder / "malformed.yml").write_text(yaml.safe_dump(study, allow_unicode=True), encoding="utf-8")
+    refused(folder, ["bench", "malformed.yml", "--dry-run"])
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -257,7 +257,8 @@ def _no_boolean(value: Any) -> Any:
     return value
 
 
-_Count = Annotated[int, BeforeValidator(_no_boolean), Field(ge=1)]
+#: a whole number from 1 on
+Count = Annotated[int, BeforeValidator(_no_boolean), Field(ge=1)]
 
 
 class RunSettings(BaseModel):
@@ -280,15 +281,15 @@ class RunSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    n_timesteps: _Count
+    n_timesteps: Count
     policy: str = "MlpPolicy"
-    n_envs: _Count = 1
+    n_envs: Count = 1
     normalize: bool | dict[str, Any] = False
     env_wrapper: NamedList = []
     vec_env_wrapper: NamedList = []
     callback: NamedList = []
     env_kwargs: dict[str, Any] = {}
-    frame_stack: _Count | None = None
+    frame_stack: Count | None = None
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
     noise_std: Annotated[FiniteFloat, Field(ge=0)] | None = None
     stop_reward: FiniteFloat | None = None

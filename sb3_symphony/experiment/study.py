@@ -19,6 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import (
     ConfigError,
+    Count,
     NamedList,
     RunConfig,
     TrainOptions,
@@ -100,7 +101,7 @@ class Algorithm(BaseModel):
     conf: str | None = None
     sweep: str | None = None
     overrides: dict[str, Any] = {}
-    steps: int | None = Field(default=None, ge=1)
+    steps: Count | None = None
     seeds: _Seeds | None = None
     environments: _List[str] | None = None
     start_from: Annotated[Start | None, BeforeValidator(partial(_part, Start, None))] = None
@@ -140,7 +141,7 @@ class Environment(BaseModel):
     overrides: dict[str, Any] = {}
     threshold: FiniteFloat | None = None
     unstable_below: FiniteFloat | None = None
-    steps: int | None = Field(default=None, ge=1)
+    steps: Count | None = None
 
 
 class Protocol(BaseModel):
@@ -154,7 +155,7 @@ class Protocol(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     eval_freq: int = Field(default=10_000, ge=0)
-    eval_episodes: int = Field(default=10, ge=1)
+    eval_episodes: Count = 10
 
 
 def _protocol(value: Any) -> Any:
@@ -222,10 +223,10 @@ class Quick(BaseModel):
     algorithms: _List[str] | None = None
     environments: _List[str] | None = None
     seeds: _Seeds | None = None
-    steps: int | None = Field(default=None, ge=1)
+    steps: Count | None = None
     protocol: _AnyProtocol | None = None
     final_episodes: int | None = Field(default=None, ge=0)
-    save_freq: int | None = Field(default=None, ge=1)
+    save_freq: Count | None = None
     overrides: dict[str, Any] = {}
     sweeps: dict[str, Any] = {}
 
@@ -270,7 +271,7 @@ class Drawing(PlotOptions):
 
     algorithms: _List[str] | None = None
     environments: _List[str] | None = None
-    gait_at: int | None = Field(default=None, ge=1)
+    gait_at: Count | None = None
 
 
 class Study(BaseModel):
@@ -299,10 +300,10 @@ class Study(BaseModel):
     algorithms: _List[Annotated[Algorithm, BeforeValidator(partial(_part, Algorithm, "name"))]]
     environments: _List[Annotated[Environment, BeforeValidator(partial(_part, Environment, "id"))]]
     seeds: _Seeds
-    steps: int | None = Field(default=None, ge=1)
+    steps: Count | None = None
     protocol: _AnyProtocol = "standard"
     final_episodes: int = Field(default=100, ge=0)
-    save_freq: int = Field(default=10_000, ge=1)
+    save_freq: Count = 10_000
     device: str = "cpu"
     matrix: Annotated[Matrix | None, BeforeValidator(partial(_part, Matrix, None))] = None
     sweeps: Annotated[dict[str, TuneOptions], BeforeValidator(_sweeps)] = {}
