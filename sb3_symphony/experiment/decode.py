@@ -6,6 +6,7 @@ Classes are found by name in allow-lists, never by evaluating text.
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from types import NoneType, UnionType
@@ -15,7 +16,6 @@ import gymnasium as gym
 import numpy as np
 from pydantic import ConfigDict, PydanticSchemaGenerationError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_symphony.common.checks import suggestion
@@ -91,8 +91,9 @@ def class_by_name(key: str, name: Any) -> Any:
     """
     known = {f"{module}.{short}": (module, short) for module, shorts in _CLASSES[key].items() for short in shorts}
     if isinstance(name, str):
+        ending = "." + re.sub(r"^th\.", "torch.", name)
         for full, (module, short) in known.items():
-            if f".{full}".endswith("." + name.replace("th.", "torch.") if name.startswith("th.") else "." + name):
+            if f".{full}".endswith(ending):
                 return getattr(import_module(module), short)
     shorts = [short for _, short in known.values()]
     near = suggestion(str(name).rpartition(".")[2], shorts) or f" — expected one of {', '.join(shorts)}"
@@ -337,7 +338,7 @@ def algorithm_arguments(
             continue
         elif key == "action_noise" and not (value == "default" and str in _alternatives(types[key])):
             value = _action_noise(value, n_actions, settings.n_envs)
-        elif key in _CLASSES and not isinstance(value, ActionNoise) and key != "action_noise":
+        elif key in _CLASSES and key != "action_noise":
             value = _named_classes(key, value)
         elif _takes_schedule(types[key]):
             value = _schedule(key, value)

@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.environment import attach_monitor_files
-from sb3_symphony.experiment.output import output_folder
+from sb3_symphony.experiment.output import output_folder, progress_bar
 from sb3_symphony.experiment.select import EnjoyOptions
 
 
@@ -79,8 +77,7 @@ def _act(agent: Agent, options: EnjoyOptions, episodes: list[EnjoyedEpisode]) ->
     env.seed(options.seed)
     observation: Any = env.reset()
     state, starts, rewards = None, np.ones(env.num_envs, dtype=bool), np.zeros(env.num_envs)
-    console = Console(stderr=True)
-    for _ in track(range(options.n_timesteps), "steps", console=console, transient=True, disable=not options.progress):
+    for _ in progress_bar(range(options.n_timesteps), "steps", options.progress):
         action, state = agent.model.predict(observation, state, starts, options.deterministic)
         observation, reward, starts, infos = env.step(action)
         rewards += reward

@@ -11,13 +11,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from sb3_symphony.analysis.statistics import summarise
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.environment import Wrappers
-from sb3_symphony.experiment.output import report
+from sb3_symphony.experiment.output import progress_bar, report
 from sb3_symphony.experiment.robustness import ActionDelay, ObservationNoise
 from sb3_symphony.experiment.select import EvaluateOptions, Selection
 
@@ -107,10 +105,8 @@ def evaluate(options: EvaluateOptions) -> Evaluation:
     with report(options.json_file) as tell, _open(options) as agent:
         seeds = range(options.seed, options.seed + options.n_episodes)
         played = _in_processes(options, seeds) if min(options.n_envs, len(seeds)) > 1 else _in_turn(agent, options, seeds)
-        bar = partial(
-            track, description="episodes", console=Console(stderr=True), transient=True, disable=not options.progress
-        )
-        result = Evaluation(agent.selection, options, list(bar(played, total=len(seeds))))
+        episodes = list(progress_bar(played, "episodes", options.progress, len(seeds)))
+        result = Evaluation(agent.selection, options, episodes)
         tell(result.as_dict())
     return result
 

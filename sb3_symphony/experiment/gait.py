@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from sb3_symphony.analysis.gait import GaitNumbers, Recording, gait_numbers, plot_gait
 from sb3_symphony.analysis.style import SUFFIXES
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file, report
+from sb3_symphony.experiment.output import output_file, progress_bar, report
 from sb3_symphony.experiment.select import GaitOptions
 from sb3_symphony.experiment.video import Camera, Shown, show_agents
 
@@ -126,9 +124,8 @@ def record_gait(shown: Shown, options: GaitOptions) -> Gait:
     wanted = {round((i + 0.5) * n_shown / options.n_frames) for i in range(options.n_frames)}
     pictures = {}
     reward, length = 0.0, 0
-    console = Console(stderr=True)
     steps = shown.agent.episode(options.seed, options.deterministic)
-    for step in track(steps, f"{shown.label} walks", console=console, transient=True, disable=not options.progress):
+    for step in progress_bar(steps, f"{shown.label} walks", options.progress, shown.most_steps(options.n_timesteps)):
         reward += step.reward
         if sensors.taking_pictures:
             pictures[length - skip] = sensors.close_up()

@@ -3,12 +3,14 @@
 import json
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sb3_symphony.experiment.config import ConfigError
+
+_Item = TypeVar("_Item")
 
 
 def output_file(name: str | Path, flag: str, suffixes: Sequence[str] = ()) -> Path:
@@ -93,6 +95,20 @@ def report(name: str | None) -> Iterator[Callable[[Any], None]]:
             write_output(path, (text + "\n").encode(), "--json")
 
     yield tell
+
+
+def progress_bar(items: Iterable[_Item], what: str, shown: bool, total: float | None = None) -> Generator[_Item, None, None]:
+    """
+    :param items: what is worked through
+    :param what: name of the bar
+    :param shown: whether there is one: on standard error, with the time left, gone at the end
+    :param total: number of items, or the most there can be; None: unknown, if they have no length
+    :return: the items
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(items, what, total, console=Console(stderr=True), transient=True, disable=not shown)
 
 
 def _try_to_write(folder: Path, name: str | Path, flag: str) -> None:

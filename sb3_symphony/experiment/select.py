@@ -16,6 +16,7 @@ from sb3_symphony.experiment.config import (
     ConfigError,
     NamedList,
     RunSettings,
+    TrainOptions,
     check_algorithm,
     read_yaml,
     run_settings,
@@ -24,7 +25,7 @@ from sb3_symphony.experiment.config import (
 from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
-_DEFAULT_ALGO, _DEFAULT_ENV = "symphony", "BipedalWalker-v3"
+_DEFAULT_ALGO, _DEFAULT_ENV = TrainOptions().algo, TrainOptions().env
 
 
 class SelectOptions(BaseModel):

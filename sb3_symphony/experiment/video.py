@@ -6,7 +6,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,12 +17,10 @@ import numpy as np
 from matplotlib.font_manager import findfont
 from matplotlib.ticker import EngFormatter
 from PIL import Image, ImageDraw, ImageFont
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file, output_folder
+from sb3_symphony.experiment.output import output_file, output_folder, progress_bar
 from sb3_symphony.experiment.select import AgentsOptions, Selection, SelectOptions, VideoOptions
 
 SUFFIXES = (".mp4", ".gif")
@@ -89,6 +87,14 @@ class Shown:
     def steps_per_second(self) -> float:
         """Of the simulated world."""
         return float(self.camera.metadata.get("render_fps") or 30)
+
+    def most_steps(self, wanted: int | None) -> int | None:
+        """
+        :param wanted: where an episode is left, None: at its end
+        :return: the most steps that it can have, None if nobody knows
+        """
+        limit = self.camera.spec.max_episode_steps if self.camera.spec else None
+        return min((steps for steps in (limit, wanted) if steps is not None), default=None)
 
 
 def _labels(selections: Sequence[Selection]) -> list[str]:
@@ -367,21 +373,14 @@ def _film(agents: Sequence[Shown], options: VideoOptions, output: Path) -> Path:
     highest = 25.0 if output.suffix.lower() == ".gif" else 50.0  # what players of GIFs keep up with; what looks smooth
     fps = float(options.fps or min(highest, max(shown.steps_per_second for shown in agents)))
     width = options.width or (None if len(agents) == 1 else 400)
-    limits = [shown.camera.spec.max_episode_steps if shown.camera.spec else None for shown in agents]
-    ends = [min(limit or math.inf, options.n_timesteps or math.inf) for limit in limits]
-    seconds = max(end / shown.steps_per_second for end, shown in zip(ends, agents, strict=True)) + _HOLD
-    total = options.n_episodes * seconds * fps if math.isfinite(seconds) else None
-    columns = (TextColumn("filming"), BarColumn(), TextColumn("{task.completed:.0f} pictures"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not options.progress) as progress:
-        task = progress.add_task("", total=total)
-
-        def counted() -> Iterator[np.ndarray]:
-            for picture in _pictures(agents, options, fps, width):
-                yield picture
-                progress.advance(task)
-
-        try:
-            write_film(counted(), fps, output)
-        except OSError as error:
-            raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror or error}") from None
+    seconds = [(shown.most_steps(options.n_timesteps) or math.inf) / shown.steps_per_second for shown in agents]
+    total = options.n_episodes * (max(seconds) + _HOLD) * fps
+    pictures = progress_bar(
+        _pictures(agents, options, fps, width), "filming", options.progress, total if math.isfinite(total) else None
+    )
+    try:
+        with closing(pictures):  # the bar goes before an error is told
+            write_film(pictures, fps, output)
+    except OSError as error:
+        raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror or error}") from None
     return output
