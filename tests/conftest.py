@@ -1,8 +1,11 @@
 """Shared fixtures: small, fast models of all three algorithms."""
 
+import os
 import signal
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -60,3 +63,16 @@ def make(algorithm: type[BaseAlgorithm]) -> Callable[..., Any]:
 def pendulum() -> Callable[..., VecEnv]:
     """``pendulum(n_envs=1, episode=25)``: a vectorised Pendulum with short episodes, which are truncated."""
     return _pendulum
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 400 kB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if os.name != "posix" or os.geteuid() != 0:
+        pytest.skip("only root can mount a file system")
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)], capture_output=True).returncode:
+        pytest.skip("cannot mount a file system here")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)

@@ -4,13 +4,42 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 
 from sb3_symphony.common.checkpoint import Checkpoint, newest_checkpoint
+from sb3_symphony.common.files import unseal
 
 # Times differ from run to run, segments with the checkpoints' frequency; files and replay are compared apart
 NOT_COMPARED = {"elapsed", "episode_times", "t", "log folder", "segments", "files"}
+
+
+class GlobalRandomEnv(gym.Env):
+    """
+    Draws from numpy's global generator, whose state at the episode's start nobody knows: replaying actions leads elsewhere.
+
+    :param where: what is drawn, ``observation`` or ``reward``; with ``end`` nothing, and episodes have three steps
+    """
+
+    observation_space = action_space = gym.spaces.Box(-1.0, 1.0, (3,))
+
+    def __init__(self, where="observation"):
+        self.where = where
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n = 0
+        return self._draw("observation"), {}
+
+    def _draw(self, what):
+        return np.random.uniform(-1, 1, 3).astype(np.float32) if what == self.where else np.zeros(3, np.float32)
+
+    def step(self, action):
+        self.n += 1
+        reward = float(self._draw("reward").sum())
+        ends = self.where == "end" and self.n == 3
+        return self._draw("observation"), reward, bool(ends), False, {}
 
 
 def difference(a: Any, b: Any, name: str = "") -> str | None:
@@ -39,13 +68,11 @@ def difference(a: Any, b: Any, name: str = "") -> str | None:
 
 def replay_rows(run: Path, checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     """The transitions of a checkpoint, oldest first, put together from its segments."""
-    from sb3_symphony.common.checkpoint import _unseal
-
     if not checkpoint.state["segments"]:
         return {}
     rows: dict[str, dict[int, np.ndarray]] = {}
     for segment in checkpoint.state["segments"]:
-        for name, array in _unseal(run / "checkpoints" / segment.file, segment.checksum).items():
+        for name, array in unseal(run / "checkpoints" / segment.file, segment.checksum).items():
             rows.setdefault(name, {}).update(zip(range(segment.start, segment.stop), array, strict=True))
     size = checkpoint.state["buffer"]["attributes"]["buffer_size"]
     return {name: np.stack([array for _, array in sorted(by_row.items())][-size:]) for name, by_row in rows.items()}

@@ -243,7 +243,7 @@ def test_a_disk_that_fills_up_leaves_the_old_file(pendulum, folder, monkeypatch)
     def full(path, content):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("sb3_symphony.common.checkpoint.write_atomically", full)
+    monkeypatch.setattr("sb3_symphony.experiment.output.write_atomically", full)
     with pytest.raises(ConfigError, match=r"--json: 'out\.json' cannot be written — No space left on device"):
         evaluate(EvaluateOptions(**pendulum, n_episodes=1, json_file="out.json"))
     assert (folder / "out.json").read_text() == "mine"

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -269,6 +270,29 @@ def test_a_failed_cell_stops_nothing(folder, monkeypatch, capsys):
     assert "Traceback" in (folder / "results" / "td3" / "Raise-v0_0.log").read_text()
 
 
+def test_disk_that_fills_up(small_disk, whole, folder, capsys):
+    """Before anything begins, and while a cell is trained; once there is room, the same command goes on, bit for bit."""
+    study = write_study(folder, algorithms=STUDY["algorithms"][:1], seeds=1)
+    results, filler = small_disk / "results", small_disk / "filler"
+    command = ["bench", str(study), "-j", "1", "-f", str(results)]
+    results.mkdir()
+    (results / "study.yml").write_text("an earlier one")
+    with filler.open("wb", buffering=0) as file, suppress(OSError):
+        while file.write(bytes(1024)):
+            pass
+    assert "results' cannot be written: No space left on device — once there is room, the" in fails(capsys, *command)
+    assert (results / "study.yml").read_text() == "an earlier one"
+
+    os.truncate(filler, filler.stat().st_size - 40_000)
+    assert main(command) in (1, 2)  # 2: the report has no room either
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("failed td3/Pendulum-v1_0 ")]
+    assert len(lines) == 1 and "No space left on device" in lines[0]
+
+    subprocess.run(["mount", "-o", "remount,size=16m", str(small_disk)], check=True)
+    assert main(command) == 0
+    assert_same_results(results / "td3" / "Pendulum-v1_0", whole / "td3" / "Pendulum-v1_0")
+
+
 def test_two_at_once_are_refused(folder, capsys):
     (folder / "results").mkdir()
     with FileLock(folder / "results" / ".lock"):
@@ -285,7 +309,7 @@ def job(folder):
     options = {"algo": "td3", "env": "Pendulum-v1", "n_timesteps": 10**6, "seed": 0, "save_freq": 100, "hyperparams": SMALL}
     options |= {"num_threads": 1, "eval_freq": 0, "verbose": 0, "progress": False}
     (folder / "session").mkdir()
-    job = Job("td3/x", options, str(folder / "td3" / "x"), 0, str(folder / "session"))
+    job = Job("td3/x", options, str(folder / "td3" / "x"), 0, {}, str(folder / "session"))
     job.control.say(0)
     return job
 

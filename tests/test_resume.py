@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from filelock import FileLock
-from resume_helpers import assert_same_results, difference, monitor_rows
+from resume_helpers import GlobalRandomEnv, assert_same_results, difference, monitor_rows
 from stable_baselines3.common.logger import Logger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -38,24 +38,8 @@ class Killed(BaseException):
     """What takes the place of ``kill -9`` inside a process: nothing handles it."""
 
 
-class GlobalRandomEnv(gym.Env):
-    """Draws from numpy's global generator: replaying its actions leads elsewhere."""
-
-    observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return np.random.uniform(-1, 1, 2).astype(np.float32), {}
-
-    def step(self, action):
-        self.steps += 1
-        return np.random.uniform(-1, 1, 2).astype(np.float32), float(action[0]), False, self.steps == 40, {}
-
-
 if "GlobalRandom-v0" not in gym.registry:
-    gym.register("GlobalRandom-v0", entry_point=GlobalRandomEnv)
+    gym.register("GlobalRandom-v0", entry_point=GlobalRandomEnv, max_episode_steps=40)
 
 
 @pytest.fixture(autouse=True)
@@ -507,19 +491,6 @@ def test_no_room_at_the_end(monkeypatch, capsys):
     assert error.count("\n") == 1 and "No space left on device — once there is room, --resume goes on" in error
     assert main(["train", "--resume", "b/td3/Pendulum-v1_1"]) == 0
     assert_same_results(whole, Path("b/td3/Pendulum-v1_1"))
-
-
-@pytest.fixture
-def small_disk(folder):
-    """A file system of 400 kB."""
-    disk = folder / "disk"
-    disk.mkdir()
-    if os.name != "posix" or os.geteuid() != 0:
-        pytest.skip("only root can mount a file system")
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)], capture_output=True).returncode:
-        pytest.skip("cannot mount a file system here")
-    yield disk
-    subprocess.run(["umount", str(disk)], check=True)
 
 
 def test_disk_that_fills_up(small_disk, folder):

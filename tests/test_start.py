@@ -17,7 +17,8 @@ from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_symphony.cli import main
-from sb3_symphony.common.checkpoint import ReplaySegments, add_transitions, newest_checkpoint
+from sb3_symphony.common.checkpoint import newest_checkpoint
+from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
 from sb3_symphony.experiment.config import ConfigError, RunSettings, TrainOptions, load_config
 from sb3_symphony.experiment.decode import algorithm_arguments
 from sb3_symphony.experiment.dry_run import as_yaml, dry_run

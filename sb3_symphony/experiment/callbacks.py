@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.statistics import first_stable_evaluation
-from sb3_symphony.common.checkpoint import write_atomically
+from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.decode import argument_types, class_by_name, typed_arguments
 from sb3_symphony.experiment.signals import handled_by

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
 
+from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError, TrainOptions
 from sb3_symphony.experiment.run_folder import RunFolder
 
@@ -128,6 +129,20 @@ def supervise(job: Job) -> Outcome:
     said = job.control.heard()
     if said is None or said["stop"]:
         return Outcome("queued")
+    try:
+        code = _execute(job)
+    except OSError as error:  # a full disk, for example
+        return Outcome("failed", f"'{error.filename or job.log}' cannot be written — {error.strerror}")
+    if code == 0:
+        return Outcome("done")
+    said = job.control.heard()
+    if code == _STOPPED or (said is not None and said["stop"]):
+        return Outcome("stopped")
+    return Outcome("failed", _reason(code, job.log))
+
+
+def _execute(job: Job) -> int:
+    """Start the cell's own process and wait for its exit code."""
     job.log.parent.mkdir(parents=True, exist_ok=True)
     job.started.write_text(socket.gethostname(), encoding="utf-8")
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
@@ -142,12 +157,7 @@ def supervise(job: Job) -> Outcome:
             env={**os.environ, **one_thread},
             check=False,
         )
-    if ended.returncode == 0:
-        return Outcome("done")
-    said = job.control.heard()
-    if ended.returncode == _STOPPED or (said is not None and said["stop"]):
-        return Outcome("stopped")
-    return Outcome("failed", _reason(ended.returncode, job.log))
+    return ended.returncode
 
 
 def _reason(code: int, log: Path) -> str:
@@ -250,7 +260,6 @@ def run_cell(job: Job) -> bool:
     :return: whether it is done; False if it was stopped
     :raises ConfigError: if options or configuration are wrong
     """
-    from sb3_symphony.common.checkpoint import write_atomically
     from sb3_symphony.experiment.train import train
 
     options = TrainOptions.model_validate(job.options)

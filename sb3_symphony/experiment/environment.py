@@ -24,8 +24,8 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_normalize,
 )
 
-from sb3_symphony.common.checkpoint import RecordedEpisode
 from sb3_symphony.common.checks import suggestion
+from sb3_symphony.common.recording import RecordedEpisode
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
 from sb3_symphony.experiment.config import ConfigError, RunSettings
 from sb3_symphony.experiment.decode import typed_arguments

@@ -16,7 +16,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.cell import Control, Job, Outcome, begun, read_result, supervise
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, parse_yaml, read_yaml
 from sb3_symphony.experiment.registry import is_file, without_folder
@@ -263,12 +264,12 @@ def _write_settings(progress: Sequence[Progress], folder: Path, study: Path) -> 
     """What the cells read. They may run on machines that have neither the study nor its files."""
     settings = folder / "settings"
     settings.mkdir(parents=True, exist_ok=True)
-    (folder / "study.yml").write_bytes(study.read_bytes())
+    write_atomically(folder / "study.yml", study.read_bytes())
     for each in progress:
         content = yaml.safe_dump(each.config.plain, sort_keys=False)
         path = _settings_file(each, folder)
         if not path.is_file() or path.read_text(encoding="utf-8") != content:
-            path.write_text(content, encoding="utf-8")
+            write_atomically(path, content.encode())
         file, _, _ = each.cell.options.algo.rpartition(":")
         if file:
             shutil.copy(file, settings)
@@ -318,7 +319,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: Path, path: Path) -> BenchResult:
     from sb3_symphony.experiment.backends import open_backend
-    from sb3_symphony.experiment.output import output_folder
+    from sb3_symphony.experiment.output import full_disk_told, output_folder
 
     left = [each for each in progress if not each.kept]
     interrupted = False
@@ -329,7 +330,7 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
         backend = open_backend(options.backend, options.n_jobs, options.address, gpus)
         try:
             new = not folder.exists()
-            with _alone(output_folder(folder, "-f")):
+            with _alone(output_folder(folder, "-f")), full_disk_told(folder, "the same command goes on"):
                 session = _new_session(backend, folder, new)
                 interrupted = _search(study, progress, options, path, folder)
                 progress = _standings(study, path, folder)  # some had to wait for their settings
@@ -429,9 +430,10 @@ class _Session:
             said, beat = 0, time.monotonic()
             while thread.is_alive():
                 thread.join(timeout=1.0)
-                if self.stop != said or time.monotonic() - beat >= _BEAT:
-                    said, beat = self.stop, time.monotonic()
-                    self.control.say(said)
+                with suppress(OSError):  # a full disk: said again. Cells that hear nothing for long save and stop
+                    if self.stop != said or time.monotonic() - beat >= _BEAT:
+                        self.control.say(self.stop)
+                        said, beat = self.stop, time.monotonic()
                 self._look()
                 view.update(stopping=self.stop > 0)
         if self.error is not None:
@@ -490,7 +492,6 @@ def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:
     """
     from sb3_symphony.analysis.matrix import matrix_rows, matrix_table, plot_matrix
     from sb3_symphony.analysis.tables import EPISODE_COLUMNS, as_csv, episode_rows, markdown_table, run_row
-    from sb3_symphony.common.checkpoint import write_atomically
 
     try:
         results = [_result(each) for each in progress]

@@ -1,5 +1,6 @@
 """Files that a command is told to write: refused before the work begins, and written whole or not at all."""
 
+import errno
 import json
 import os
 import tempfile
@@ -8,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError
 
 _Item = TypeVar("_Item")
@@ -125,9 +127,25 @@ def write_output(path: Path, content: bytes, flag: str) -> None:
     :param flag: the flag that names the file, for messages
     :raises ConfigError: if it cannot be written, because the disk is full for example
     """
-    from sb3_symphony.common.checkpoint import write_atomically  # which loads torch: not to look whether a file can be written
-
     try:
         write_atomically(path, content)
     except OSError as error:
         raise ConfigError(f"{flag}: '{path}' cannot be written — {error.strerror}") from None
+
+
+@contextmanager
+def full_disk_told(path: Path, onward: str = "") -> Iterator[None]:
+    """
+    A full disk ends the block with one line.
+
+    :param path: what is written inside, for messages
+    :param onward: what to do once there is room, in words
+    :raises ConfigError: if the disk is full
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        hint = f" — once there is room, {onward}" if onward else ""
+        raise ConfigError(f"'{path}' cannot be written: {error.strerror}{hint}") from error

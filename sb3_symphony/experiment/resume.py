@@ -13,7 +13,8 @@ from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger,
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch.utils.tensorboard import SummaryWriter
 
-from sb3_symphony.common.checkpoint import Checkpoint, DamagedCheckpoint, checkpoint_files, newest_checkpoint, write_atomically
+from sb3_symphony.common.checkpoint import Checkpoint, checkpoint_files, newest_checkpoint
+from sb3_symphony.common.files import DamagedFile, write_atomically
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
 from sb3_symphony.experiment.run_folder import RunFolder
 
@@ -64,7 +65,7 @@ class StoredRun:
         """
         try:
             checkpoint = newest_checkpoint(self.run.checkpoints)
-        except DamagedCheckpoint as error:
+        except DamagedFile as error:
             raise ConfigError(f"--resume: no checkpoint of '{self.run.path}' is whole — {error}") from None
         if checkpoint is None and self.steps > 0:  # it had learned something, which must not be overwritten
             raise ConfigError(

@@ -13,7 +13,7 @@ import optuna
 import yaml
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_symphony.common.checkpoint import write_atomically
+from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge
 from sb3_symphony.experiment.space import parse_space
 from sb3_symphony.experiment.sweep_storage import WORKER

@@ -1,6 +1,5 @@
 """One training run, from options to files on disk."""
 
-import errno
 import shlex
 import time
 from collections.abc import Iterator
@@ -38,7 +37,7 @@ from sb3_symphony.experiment.environment import (
     make_evaluation_env,
     make_training_env,
 )
-from sb3_symphony.experiment.output import check_folder
+from sb3_symphony.experiment.output import check_folder, full_disk_told
 from sb3_symphony.experiment.protocol import keep_protocol, solved_stride
 from sb3_symphony.experiment.registry import load_algorithm
 from sb3_symphony.experiment.resume import continue_logs, open_run, restore_files
@@ -223,17 +222,6 @@ def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     save_model(model, run.model, run.normalization)
 
 
-@contextmanager
-def _full_disk_told(run: RunFolder) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise
-        onward = " — once there is room, --resume goes on from the newest checkpoint" if run.checkpoints.is_dir() else ""
-        raise ConfigError(f"'{run.path}' cannot be written: {error.strerror}{onward}") from error
-
-
 def effective_config(options: TrainOptions) -> RunConfig:
     """
     :param options: options of the command line
@@ -387,7 +375,8 @@ def _train(
     total = config.settings.n_timesteps
     if not options.quiet:
         print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
-    with stop.listening(), _full_disk_told(run):
+    onward = "--resume goes on from the newest checkpoint" if options.save_freq > 0 else ""
+    with stop.listening(), full_disk_told(run.path, onward):
         try:
             model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:

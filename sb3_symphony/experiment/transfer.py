@@ -12,7 +12,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl, recursive_getattr
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
-from sb3_symphony.common.checkpoint import DamagedCheckpoint, ReplaySegments, add_transitions, newest_checkpoint
+from sb3_symphony.common.checkpoint import newest_checkpoint
+from sb3_symphony.common.files import DamagedFile
+from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
 from sb3_symphony.experiment.agent import check_match, load_model, load_normalization
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, of_networks, read_yaml
 from sb3_symphony.experiment.run_folder import RunFolder
@@ -113,7 +115,7 @@ def _take_experience(model: BaseAlgorithm, selection: Selection) -> None:
     parts, source = _experience(selection)
     try:
         taken = add_transitions(buffer, parts)
-    except DamagedCheckpoint as error:
+    except DamagedFile as error:
         raise ConfigError(f"--with-replay-buffer: {source}: {error}") from None
     except (ValueError, TypeError) as error:
         raise ConfigError(f"--with-replay-buffer: {source} — {error}") from None
@@ -128,7 +130,7 @@ def _experience(selection: Selection) -> tuple[Iterator[dict[str, np.ndarray]], 
         run = RunFolder(selection.run, "")
         try:
             checkpoint = newest_checkpoint(run.checkpoints)
-        except DamagedCheckpoint as error:
+        except DamagedFile as error:
             raise ConfigError(f"--with-replay-buffer: {run.checkpoints} — {error}") from None
         if checkpoint is not None:
             return ReplaySegments(run.checkpoints, checkpoint.state["segments"]).transitions(), run.checkpoints
