@@ -188,15 +188,15 @@ def test_sweeps_conditions_and_figures(write, tmp_path):
         )
     )
     cell = cells_of(study, tmp_path, tmp_path / "results")[0]
-    assert cell.waits and cell.sweep == tmp_path / "results" / "sweeps" / "td3" / "tune" / "s" / "best.yml"
+    assert cell.waits and cell.sweep == "s" and cell.found == tmp_path / "results" / "settings" / "s_best_of_3.yml"
     assert configuration(cell).settings.n_timesteps == 60
     assert cell.conditions["1"]["action_delay"] == 1
     assert EvaluateOptions(**cell.conditions["short"]).env_wrapper == [(wrapper, {"a": 1})]
     options = sweep_options(study, "s", tmp_path, tmp_path / "results")
     assert (options.conf_file, options.n_trials, options.name) == (str(tmp_path / "fixed.yml"), 3, "s")
     assert read_study(tmp_path / "study.yml", quick=True).sweeps["s"].n_trials == 1
-    cell.sweep.parent.mkdir(parents=True)
-    cell.sweep.write_text("n_timesteps: 5\ngamma: 0.7\n")
+    cell.found.parent.mkdir(parents=True)
+    cell.found.write_text("n_timesteps: 5\ngamma: 0.7\n")
     found = cells_of(study, tmp_path, tmp_path / "results")[0]
     assert not found.waits and configuration(found).arguments == {"gamma": 0.7}
 

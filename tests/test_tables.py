@@ -111,7 +111,7 @@ def test_what_is_not_done_or_not_standard_is_told(result):
     (a, b, c), notes = table_of(results)
     assert (a["algorithm"], a["seeds"], a["S300 median"]) == ("a", "1 of 3", "1 000")
     assert b["algorithm"] == "b (non-standard)" and b["seeds"] == "1"
-    assert c["seeds"] == "0 of 1" and c["S300 median"] == c["updates"] == "–"
+    assert c["seeds"] == "not run yet" and c["S300 median"] == c["updates"] == "–"
     assert "- non-standard: evaluated every 1 000 steps on 1 episode" in notes
     assert "- not done, and not in these numbers: a 1, a 2, c 0" in notes
 

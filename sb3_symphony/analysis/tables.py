@@ -294,6 +294,13 @@ def _columns(results: Sequence[Result]) -> list[Column]:
     return columns
 
 
+def _steps_so_far(results: Sequence[Result]) -> str:
+    steps = [
+        each.run.episodes.steps[-1] for each in results if each.run and each.run.episodes and len(each.run.episodes.steps)
+    ]
+    return f"{_number(max(steps))} so far" if steps else _NOTHING
+
+
 def _steps(done: Sequence[Result]) -> tuple[list[int], list[bool]]:
     return [each.events.stable.step for each in done], [each.events.stable.reached for each in done]
 
@@ -332,7 +339,9 @@ def markdown_table(results: Sequence[Result]) -> str:
         done = [each for each in own if each.summary is not None]
         mark = "" if all(each.standard for each in own if each.run) else " (non-standard)"
         seeds = f"{len(done)}" if len(done) == len(own) else f"{len(done)} of {len(own)}"
-        steps = " or ".join(_number(n) for n in sorted({_summary(each)["steps"] for each in done})) or _NOTHING
+        if all(each.run is None for each in own):
+            seeds = "not run yet"
+        steps = " or ".join(_number(n) for n in sorted({_summary(each)["steps"] for each in done})) or _steps_so_far(own)
         cells = [write(done) if done else _NOTHING for _, write in columns]
         rows.append([algorithm + mark, seeds, steps, *cells, *[own[0].reported or _NOTHING] * told])
     names = [name for name, _ in columns]
@@ -372,7 +381,7 @@ def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     other = sorted({_protocol(each.run) for each in results if each.run is not None and not each.standard})
     lines += [f"- non-standard: {protocol}" for protocol in other]
     lines += _repeated(results)
-    missing = [f"{each.algorithm} {each.seed}" for each in results if each.summary is None]
+    missing = [f"{each.algorithm} {each.seed}" for each in results if each.run is not None and each.summary is None]
     if missing:
         lines.append(f"- not done, and not in these numbers: {', '.join(missing)}")
     return lines

@@ -12,6 +12,7 @@ Results lie in one folder, which holds all that is needed to go on or to make th
 """
 
 import os
+import re
 import shutil
 import threading
 import time
@@ -31,7 +32,17 @@ from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions,
 from sb3_symphony.experiment.registry import is_file, without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.signals import handled_by
-from sb3_symphony.experiment.study import Cell, Drawing, Environment, Study, cells_of, configuration, read_study, sweep_options
+from sb3_symphony.experiment.study import (
+    Cell,
+    Drawing,
+    Environment,
+    Study,
+    cells_of,
+    configuration,
+    found_by,
+    read_study,
+    sweep_options,
+)
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.tables import Result
@@ -54,6 +65,7 @@ class BenchOptions(BaseModel):
     address: str | None = None
     algo: list[str] = []
     report: bool = False
+    page: str | None = None
     dry_run: bool = False
 
 
@@ -155,7 +167,11 @@ def bench(options: BenchOptions) -> BenchResult:
     """
     if options.address is not None and options.backend != "ray":
         raise ConfigError(f"--address: '{options.address}' — is for --backend ray")
+    if options.page is not None:
+        _on_page(options.page, "")
     path = Path(options.study)
+    if options.page is not None and not options.report:
+        raise ConfigError(f"--page: '{options.page}' — belongs to --report")
     study = read_study(path, options.quick, options.algo)
     name = path.absolute().parent.name if path.stem == "study" else path.stem
     study = study.model_copy(update={"title": study.title or name})
@@ -167,9 +183,14 @@ def bench(options: BenchOptions) -> BenchResult:
         _check_models([each for each in progress if not each.kept])
         return BenchResult(folder, plain_table(progress), untouched=True)
     if options.report:
+        from sb3_symphony.experiment.output import write_output
+
         if not any(each.run.path.is_dir() for each in progress):
             raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
-        return BenchResult(folder, report(study, progress, folder))
+        table = report(study, progress, folder)
+        if options.page is not None:
+            write_output(Path(options.page), _on_page(options.page, table).encode(), "--page")
+        return BenchResult(folder, table)
     return _run(options, study, progress, folder, path)
 
 
@@ -195,9 +216,9 @@ def _standing(cell: Cell, folder: Path) -> Progress:
     run = RunFolder(folder / cell.name, RunFolder.file_name(cell.environment.id))
     progress = Progress(cell, config, run)
     if cell.waits:
-        assert cell.sweep is not None
-        progress.reason = f"waits for the search '{cell.sweep.parent.name}'"
-    if cell.waits or not begun(run):
+        progress.reason = f"waits for the search '{cell.sweep}'"
+        return progress
+    if not begun(run):
         return progress
     _check_same(progress)
     progress.look()
@@ -266,6 +287,8 @@ def _write_settings(progress: Sequence[Progress], folder: Path, study: Path) -> 
     settings.mkdir(parents=True, exist_ok=True)
     write_atomically(folder / "study.yml", study.read_bytes())
     for each in progress:
+        if each.cell.waits:
+            continue
         content = yaml.safe_dump(each.config.plain, sort_keys=False)
         path = _settings_file(each, folder)
         if not path.is_file() or path.read_text(encoding="utf-8") != content:
@@ -332,11 +355,15 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
             new = not folder.exists()
             with _alone(output_folder(folder, "-f")), full_disk_told(folder, "the same command goes on"):
                 session = _new_session(backend, folder, new)
-                interrupted = _search(study, progress, options, path, folder)
-                progress = _standings(study, path, folder)  # some had to wait for their settings
                 _write_settings(progress, folder, path)
-                while not interrupted and (ready := _ready(progress)):
-                    interrupted = _Session(progress, ready, folder, session, backend, study.tensorboard).run()
+                interrupted = _run_ready(study, progress, folder, session, backend)
+                waiting = {each.cell.name for each in progress if each.cell.waits}
+                if waiting and not interrupted:
+                    interrupted = _search(study, progress, options, path, folder)
+                    now = {each.cell.name: each for each in _standings(study, path, folder)}
+                    progress = [now[each.cell.name] if each.cell.name in waiting else each for each in progress]
+                    _write_settings(progress, folder, path)
+                    interrupted = interrupted or _run_ready(study, progress, folder, session, backend)
                 shutil.rmtree(session)
         finally:
             backend.close()
@@ -345,6 +372,18 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
             each.state, each.reason = "failed", each.reason or "the run that it starts from is not done"
     failed = [(each.cell.name, each.reason) for each in progress if each.state == "failed"]
     return BenchResult(folder, report(study, progress, folder), failed, interrupted)
+
+
+def _run_ready(study: Study, progress: list[Progress], folder: Path, session: Path, backend: "Backend") -> bool:
+    """
+    Run cells as long as there are some whose beginning is there.
+
+    :return: whether that was stopped by a signal
+    """
+    while ready := _ready(progress):
+        if _Session(progress, ready, folder, session, backend, study.tensorboard).run():
+            return True
+    return False
 
 
 def _ready(progress: Sequence[Progress]) -> list[Progress]:
@@ -363,7 +402,7 @@ def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, p
     from sb3_symphony.experiment.tune import tune
 
     cores = options.n_jobs or os.cpu_count() or 1
-    wanted = {each.cell.sweep.parent.name for each in progress if each.cell.sweep is not None and not each.kept}
+    wanted = {each.cell.sweep for each in progress if each.cell.waits}
     for name in (name for name in study.sweeps if name in wanted):
         sweep = sweep_options(study, name, path.absolute().parent, folder)
         n_jobs = max(1, cores // sweep.seeds_per_trial)
@@ -371,6 +410,9 @@ def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, p
         print(result.summary, flush=True)
         if result.interrupted:
             return True
+        best = result.folder / "best.yml"
+        if best.is_file():
+            write_atomically(found_by(study, name, folder), best.read_bytes())
     return False
 
 
@@ -478,6 +520,20 @@ class _Session:
 # ----------------------------------------------------------------------------------------------------------------------
 # Afterwards
 # ----------------------------------------------------------------------------------------------------------------------
+
+
+_PAGE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- /results -->)", re.DOTALL)
+
+
+def _on_page(name: str, table: str) -> str:
+    """A page with the tables between its two marks."""
+    try:
+        page = Path(name).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--page: '{name}' cannot be read — {error}") from None
+    if len(_PAGE.findall(page)) != 1:
+        raise ConfigError(f"--page: '{name}' — expected one line '<!-- results -->' and, further down, '<!-- /results -->'")
+    return _PAGE.sub(lambda _: f"\n{table}\n", page)
 
 
 def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:

@@ -324,7 +324,8 @@ class Cell:
     :param final_episodes: episodes to evaluate the model on at the end, also under each condition
     :param conditions: name → options of ``evaluate`` that differ
     :param start_from: the cell whose agent it starts from, None: a new one
-    :param sweep: file of the search that its settings come from, None if there is none
+    :param sweep: name of the search that its settings come from, None if there is none
+    :param found: file that this search leaves when it is done
     """
 
     algorithm: str
@@ -334,7 +335,8 @@ class Cell:
     final_episodes: int
     conditions: dict[str, dict[str, Any]] = field(default_factory=dict)
     start_from: "Cell | None" = None
-    sweep: Path | None = None
+    sweep: str | None = None
+    found: Path | None = None
 
     @property
     def name(self) -> str:
@@ -344,7 +346,7 @@ class Cell:
     @property
     def waits(self) -> bool:
         """Whether its settings are not known yet."""
-        return self.sweep is not None and not self.sweep.is_file()
+        return self.found is not None and not self.found.is_file()
 
 
 def read_study(path: Path, quick: bool = False, only: Sequence[str] = ()) -> Study:
@@ -513,11 +515,21 @@ def cells_of(study: Study, folder: Path, results: Path | None = None) -> list[Ce
 def _cell(study: Study, algorithm: Algorithm, environment: Environment, seed: int, folder: Path, results: Path) -> Cell:
     matrix = study.matrix
     conditions = {} if matrix is None else {name: each.model_dump() for name, each in matrix.conditions.items()}
-    sweep = None
-    if algorithm.sweep is not None:
-        sweep = sweep_options(study, algorithm.sweep, folder, results).folder / "best.yml"
-    options = _options(study, algorithm, environment, seed, folder, sweep)
-    return Cell(algorithm.name, environment, seed, options, study.final_episodes, conditions, sweep=sweep)
+    found = None if algorithm.sweep is None else found_by(study, algorithm.sweep, results)
+    options = _options(study, algorithm, environment, seed, folder, found)
+    return Cell(
+        algorithm.name, environment, seed, options, study.final_episodes, conditions, sweep=algorithm.sweep, found=found
+    )
+
+
+def found_by(study: Study, name: str, results: Path) -> Path:
+    """
+    :param study: a study
+    :param name: name of one of its searches
+    :param results: folder of its results
+    :return: file of the best settings, which is there once all trials have ended
+    """
+    return results / "settings" / f"{name}_best_of_{study.sweeps[name].n_trials}.yml"
 
 
 def sweep_options(study: Study, name: str, folder: Path, results: Path) -> TuneOptions:
@@ -540,11 +552,11 @@ def _conf(name: str | None, folder: Path) -> str | None:
 
 
 def _options(
-    study: Study, algorithm: Algorithm, environment: Environment, seed: int, folder: Path, sweep: Path | None
+    study: Study, algorithm: Algorithm, environment: Environment, seed: int, folder: Path, found: Path | None
 ) -> TrainOptions:
     conf = _conf(algorithm.conf, folder)
-    if sweep is not None and sweep.is_file():
-        conf = str(sweep)
+    if found is not None and found.is_file():
+        conf = str(found)
     if study.protocol == "standard":
         evaluation: dict[str, Any] = {"protocol": "standard", "threshold": environment.threshold}
     else:
