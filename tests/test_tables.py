@@ -113,7 +113,9 @@ def test_what_is_not_done_or_not_standard_is_told(result):
     assert b["algorithm"] == "b (non-standard)" and b["seeds"] == "1"
     assert c["seeds"] == "not run yet" and c["S300 median"] == c["updates"] == "–"
     assert "- non-standard: evaluated every 1 000 steps on 1 episode" in notes
-    assert "- not done, and not in these numbers: a 1, a 2, c 0" in notes
+    assert "- not done, and not in these numbers: a 1, a 2" in notes
+    half_way = result("d", 0, [], [0, 0, 0], done=False)
+    assert table_of([half_way])[0][0]["steps"] == "1 500 so far"
 
 
 def test_only_columns_that_say_something(result):

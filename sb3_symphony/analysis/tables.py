@@ -381,7 +381,8 @@ def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     other = sorted({_protocol(each.run) for each in results if each.run is not None and not each.standard})
     lines += [f"- non-standard: {protocol}" for protocol in other]
     lines += _repeated(results)
-    missing = [f"{each.algorithm} {each.seed}" for each in results if each.run is not None and each.summary is None]
+    begun = {each.algorithm for each in results if each.run is not None}
+    missing = [f"{each.algorithm} {each.seed}" for each in results if each.summary is None and each.algorithm in begun]
     if missing:
         lines.append(f"- not done, and not in these numbers: {', '.join(missing)}")
     return lines
