@@ -4,6 +4,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from datetime import timedelta
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +24,7 @@ _SHARE, _SECONDS = 0.1, 60.0
 
 
 def _time(seconds: float | None) -> str:
-    if seconds is None:
-        return ""
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
+    return "" if seconds is None else str(timedelta(seconds=round(seconds)))
 
 
 def _cells(each: "Progress") -> list[str]:
