@@ -13,6 +13,7 @@ from sb3_symphony.common.wrappers import (
     EpisodeStepLimit,
     FreshBox2DWorld,
     LearningReward,
+    LegMass,
     RewardBonus,
     RewardFloor,
     RewardScale,
@@ -290,3 +291,24 @@ def test_torso_mass_refusals():
     for masses in ((5.0, 3.0), (1.0, 2.0, 3.0), (0.0, 3.0)):
         with pytest.raises(ValueError, match="mass="):
             TorsoMass(hopper("Hopper-v4"), mass=masses)
+
+
+def test_leg_mass():
+    def walker():
+        return FreshBox2DWorld(gym.make("BipedalWalker-v3"))
+
+    def masses(env, episodes):
+        for seed in range(episodes):
+            env.reset(seed=seed)
+        return np.array([body.mass for body in [env.unwrapped.hull, *env.unwrapped.legs]])
+
+    own = masses(walker(), 1)
+    np.testing.assert_allclose(masses(LegMass(walker(), 1.5), 3), own * [1, 1.5, 1.5, 1.5, 1.5], rtol=1e-6)  # not 1.5 ** 3
+    np.testing.assert_array_equal(roll(LegMass(walker(), 1.0), 0), roll(walker(), 0))
+    assert not np.array_equal(roll(LegMass(walker(), 1.2), 0), roll(walker(), 0))
+    for env in (gym.make("Pendulum-v1"), gym.make("LunarLander-v3")):
+        with pytest.raises(TypeError, match="is not a BipedalWalker"):
+            LegMass(env, 1.5)
+    for factor in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="factor"):
+            LegMass(walker(), factor)

@@ -3,7 +3,7 @@ Gymnasium wrappers, usable by dotted name as ``env_wrapper`` in a YAML configura
 
 Three kinds: what makes Box2D episodes repeatable (:class:`FreshBox2DWorld`), what changes the reward a learner sees while
 the reported return stays that of the environment (:class:`LearningReward` and its subclasses), and what changes the task
-(:class:`EpisodeStepLimit`, :class:`TorsoMass`).
+(:class:`EpisodeStepLimit`, :class:`TorsoMass`, :class:`LegMass`).
 """
 
 import math
@@ -339,3 +339,34 @@ class TorsoMass(gym.Wrapper):
             generator = self.np_random if seed is None else np.random.default_rng([seed, self.body])
             self._set(generator.uniform(*self.masses))
         return self.env.reset(seed=seed, options=options)
+
+
+class LegMass(gym.Wrapper):
+    """
+    Makes all leg segments of a BipedalWalker heavier or lighter, from the end of each reset on. Shapes stay as they are.
+
+    :param env: BipedalWalker-v3 or BipedalWalkerHardcore-v3
+    :param factor: what the density of the legs is multiplied by, > 0
+    :raises TypeError: if the environment is not a BipedalWalker
+    :raises ValueError: if the factor is not finite and > 0
+    """
+
+    def __init__(self, env: gym.Env, factor: float) -> None:
+        check_number("factor", factor, 0, exclusive=True)
+        if not (_has_box2d_world(env) and type(env.unwrapped).__name__ == "BipedalWalker"):
+            raise TypeError(f"LegMass: {env} is not a BipedalWalker")
+        super().__init__(env)
+        self.factor = float(factor)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: seed of the episode, or None to go on with the environment's generator
+        :param options: handed to the environment
+        :return: first observation and info
+        """
+        result = self.env.reset(seed=seed, options=options)
+        for leg in self.env.unwrapped.legs:  # type: ignore[attr-defined]  # bodies that this reset has made
+            for fixture in leg.fixtures:
+                fixture.density *= self.factor
+            leg.ResetMassData()
+        return result
