@@ -24,6 +24,7 @@ from sb3_symphony.experiment.decode import algorithm_arguments
 from sb3_symphony.experiment.dry_run import as_yaml, dry_run
 from sb3_symphony.experiment.environment import make_evaluation_env, make_training_env
 from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
+from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.train import build_model, train, train_seeds
 from sb3_symphony.experiment.transfer import find_trained, start_from
 
@@ -417,6 +418,15 @@ def test_evaluations_survive_a_full_disk(monkeypatch):
     with np.load(os.path.join(run.path, "evaluations.npz")) as data:
         assert data["timesteps"].tolist() == [60]
     assert ".evaluations.tmp.npz" not in os.listdir(run.path)
+
+
+def test_a_disk_that_is_full_from_the_beginning(monkeypatch):
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(RunFolder, "write_configuration", full)
+    with pytest.raises(ConfigError, match="Pendulum-v1_1' cannot be written: No space left on device"):
+        train(options())
 
 
 @pytest.mark.skipif(

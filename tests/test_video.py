@@ -1,6 +1,8 @@
 """Films: what is in them, and how long they are."""
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -115,6 +117,28 @@ def test_a_film_that_fails_leaves_the_old_one(tmp_path):
 
 
 # ---------------------------------------------------------------- films
+
+
+def test_a_film_that_ffmpeg_cannot_finish(tmp_path, monkeypatch):
+    """Neither does half a film replace the old one, nor goes it unnoticed."""
+    (tmp_path / "film.mp4").write_bytes(b"old")
+    picture = np.zeros((64, 64, 3), dtype=np.uint8)
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(256, size=(256, 256, 3), dtype=np.uint8) for _ in range(10)]
+    assert write_film([picture] * 3, 10, tmp_path / "other.mp4") == 3
+
+    class Limited(subprocess.Popen):
+        def __init__(self, command, **kwargs):
+            full = "No space left on device"
+            script = f"import sys; sys.stdin.buffer.read(100000); sys.exit('x: {full}\\nlast words')"
+            super().__init__([sys.executable, "-c", script], **kwargs)
+
+    monkeypatch.setattr(subprocess, "Popen", Limited)
+    for pictures in (noise, [picture]):  # it ends while pictures come, and after the last one
+        with pytest.raises(OSError, match=r"^No space left on device$"):
+            write_film(pictures, 10, tmp_path / "film.mp4")
+        assert (tmp_path / "film.mp4").read_bytes() == b"old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["film.mp4", "other.mp4"]
 
 
 def test_mp4(model, capsys):

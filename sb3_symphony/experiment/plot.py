@@ -74,7 +74,7 @@ def plot(options: PlotOptions, groups: "list[Group] | None" = None) -> Path:
             else:
                 plots.plot_curves(panels, options.x_axis, options.y_axis, _smoothed(options), output)
         except OSError as error:
-            raise ConfigError(f"'{error.filename}' cannot be written — {error.strerror}") from None
+            raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror}") from None
         tell({"x": options.x_axis, "panels": {title: [curve.plain() for curve in panel] for title, panel in panels.items()}})
     return output
 

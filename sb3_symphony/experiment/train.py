@@ -353,8 +353,9 @@ def _train(
         beginning = f" ({_resuming(checkpoint, model)})"
         command = f"{run.command}\n{command}"
         restore_files(run, checkpoint)
-    run.write_configuration(used.model_dump(exclude=_NOT_OF_THE_RUN), config.plain, command)
-    attach_monitor_files(env, run.path, append=checkpoint is not None)
+    with full_disk_told(run.path):
+        run.write_configuration(used.model_dump(exclude=_NOT_OF_THE_RUN), config.plain, command)
+        attach_monitor_files(env, run.path, append=checkpoint is not None)
 
     stop, evaluation, callbacks = _callbacks(options, config, run, evaluation_env, verbose)
     callbacks += own_callbacks

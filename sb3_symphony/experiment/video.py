@@ -1,9 +1,12 @@
 """Films of trained agents, drawn without a display."""
 
+import errno
 import math
 import os
 import re
+import subprocess
 import sys
+import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -303,23 +306,36 @@ def write_film(pictures: Iterable[np.ndarray], fps: float, output: Path) -> int:
 
 
 def _write_mp4(pictures: Iterable[np.ndarray], fps: float, output: Path) -> int:
-    from imageio_ffmpeg import write_frames
+    """Not by ``imageio_ffmpeg.write_frames``, which does not tell whether ffmpeg could write all of them."""
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-    writer = None
     count = 0
-    try:
-        for picture in pictures:
-            count += 1
-            # H.264 wants even sizes
-            even = np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], constant_values=255)
-            if writer is None:
-                size = (even.shape[1], even.shape[0])
-                writer = write_frames(str(output), size, fps=fps, codec="libx264", quality=7, macro_block_size=2)
-                writer.send(None)
-            writer.send(np.ascontiguousarray(even))
-    finally:
-        if writer is not None:
-            writer.close()
+    ffmpeg: subprocess.Popen[bytes] | None = None
+    with tempfile.TemporaryFile() as messages:
+        try:
+            for picture in pictures:
+                count += 1
+                # H.264 wants even sizes
+                even = np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], constant_values=255)
+                if ffmpeg is None:
+                    size = f"{even.shape[1]}x{even.shape[0]}"
+                    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-video_size", size, "-framerate", f"{fps}", "-i", "-"]
+                    wanted = ["-c:v", "libx264", "-crf", "15", "-pix_fmt", "yuv420p", "-y", str(output)]
+                    command = [get_ffmpeg_exe(), "-loglevel", "error", *given, *wanted]
+                    ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages)
+                assert ffmpeg.stdin is not None
+                ffmpeg.stdin.write(even.tobytes())
+        except BrokenPipeError:
+            pass  # it has ended, and said why
+        finally:
+            if ffmpeg is not None:
+                ffmpeg.communicate()  # closes its input, and waits
+        assert ffmpeg is not None
+        if ffmpeg.returncode:
+            messages.seek(0)
+            told = messages.read().decode(errors="replace").strip()
+            full = os.strerror(errno.ENOSPC)
+            raise OSError(full if full in told else told.rpartition("\n")[2])
     return count
 
 
