@@ -525,6 +525,7 @@ def _add_bench(commands: Any) -> None:
     add("-a", "--algo", nargs="+", metavar="NAME", help="only these algorithms of the study (default: all)")
     add("-f", "--folder", metavar="DIR", help="where results are kept (default: logs/bench/<study>)")
     add("--report", action="store_true", help="only write tables and figures")
+    add("--collect", metavar="DIR", help="with --report: copy the small files that it needs, for version control")
     add("--page", metavar="FILE", help="with --report: put the tables into this page, between <!-- results --> marks")
     add("--dry-run", action="store_true", help="only check all settings, and show the cells and how far they are")
     _add_quiet(parser)

@@ -66,6 +66,7 @@ class BenchOptions(BaseModel):
     algo: list[str] = []
     report: bool = False
     page: str | None = None
+    collect: str | None = None
     dry_run: bool = False
 
 
@@ -170,8 +171,9 @@ def bench(options: BenchOptions) -> BenchResult:
     if options.page is not None:
         _on_page(options.page, "")
     path = Path(options.study)
-    if options.page is not None and not options.report:
-        raise ConfigError(f"--page: '{options.page}' — belongs to --report")
+    for flag in ("page", "collect"):
+        if getattr(options, flag) is not None and not options.report:
+            raise ConfigError(f"--{flag}: '{getattr(options, flag)}' — belongs to --report")
     study = read_study(path, options.quick, options.algo)
     name = path.absolute().parent.name if path.stem == "study" else path.stem
     study = study.model_copy(update={"title": study.title or name})
@@ -183,13 +185,15 @@ def bench(options: BenchOptions) -> BenchResult:
         _check_models([each for each in progress if not each.kept])
         return BenchResult(folder, plain_table(progress), untouched=True)
     if options.report:
-        from sb3_symphony.experiment.output import write_output
+        from sb3_symphony.experiment.output import output_folder, write_output
 
         if not any(each.run.path.is_dir() for each in progress):
             raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
         table = report(study, progress, folder)
         if options.page is not None:
             write_output(Path(options.page), _on_page(options.page, table).encode(), "--page")
+        if options.collect is not None:
+            _collect(progress, folder, output_folder(Path(options.collect).absolute(), "--collect"))
         return BenchResult(folder, table)
     return _run(options, study, progress, folder, path)
 
@@ -520,6 +524,29 @@ class _Session:
 # ----------------------------------------------------------------------------------------------------------------------
 # Afterwards
 # ----------------------------------------------------------------------------------------------------------------------
+
+
+#: files of a run, and beside the runs, that a report needs or that tell what a search has found
+_RAW = ("*/args.yml", "*/config.yml", "*.monitor.csv", "evaluations.npz", "result.json")
+_RAW_BESIDE = ("settings/*_best_of_*.yml", "sweeps/*/tune/*/*.csv", "sweeps/*/tune/*/best.yml", "sweeps/*/tune/*/*.png")
+
+
+def _collect(progress: Sequence[Progress], folder: Path, target: Path) -> None:
+    """Copy what is small and worth keeping. Text loses the names of folders of this machine."""
+    if target == folder:
+        raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
+    found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
+    found += [path for pattern in _RAW_BESIDE for path in folder.glob(pattern)]
+    for path in found:
+        content = path.read_bytes()
+        if path.suffix == ".yml":
+            content = content.replace(f"{folder}/".encode(), b"").replace(str(folder).encode(), b".")
+        copy = target / path.relative_to(folder)
+        try:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(content)
+        except OSError as error:
+            raise ConfigError(f"--collect: '{copy}' cannot be written — {error.strerror}") from None
 
 
 _PAGE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- /results -->)", re.DOTALL)
