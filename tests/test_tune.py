@@ -260,7 +260,7 @@ def test_mistakes_in_the_program_end_the_sweep(played, options):
     assert all(trial.state.is_finished() for trial in trials)
 
 
-def test_interruption(played, options):
+def test_interruption(played, options, capsys):
     def script(config: RunConfig) -> Any:
         if len(played.started) % 2 == 0:
             signal.raise_signal(signal.SIGINT)
@@ -268,6 +268,8 @@ def test_interruption(played, options):
 
     played.script = staticmethod(script)
     results = [tune(options()) for _ in range(RETRIES + 4)]
+    assert results[0].summary.endswith("\ninterrupted — the same command goes on")
+    assert "trial 1 failed: interrupted | 1 of 5, " in capsys.readouterr().out  # it will be repeated
     assert [result.interrupted for result in results[:5]] == [True] * 4 + [False] or results[0].interrupted
     assert not results[-1].interrupted
     trials = trials_of(options())

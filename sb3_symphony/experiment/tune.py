@@ -375,7 +375,9 @@ class Sweep:
 
     @staticmethod
     def _ended(trials: list[FrozenTrial]) -> int:
-        return sum(trial.state.is_finished() for trial in trials) - len(replaced(trials))
+        again = replaced(trials)
+        interrupted = {trial.number for trial in trials if trial.user_attrs.get(ENDED) == "interrupted"}
+        return sum(trial.state.is_finished() for trial in trials) - len(again | interrupted)
 
 
 def _words(told: FrozenTrial, attributes: dict[str, Any]) -> str:
@@ -519,4 +521,5 @@ def _show(options: TuneOptions) -> TuneResult:
 def _result(study: optuna.Study, options: TuneOptions, interrupted: bool = False) -> TuneResult:
     report = SweepReport(study, options.folder)
     report.write()
-    return TuneResult(options.folder, report.summary(), interrupted)
+    onward = "\ninterrupted — the same command goes on" if interrupted else ""
+    return TuneResult(options.folder, report.summary() + onward, interrupted)
