@@ -40,6 +40,8 @@ SELECTION = {
     "--vecnormalize": NO_FILE | st.just("sac.zip"),
     "--env-kwargs": TEXT.filter(lambda text: ":" not in text)
     | st.sampled_from(["nothing:1", "g:[", "g:!!python/name:os.system"]),
+    "--env-wrapper": TEXT.filter(lambda text: ":" not in text)
+    | st.sampled_from(["os.system:{}", "gymnasium.wrappers.RecordVideo:{}", "gymnasium.wrappers.TimeLimit:{max_steps: 5}"]),
     "--gym-packages": st.sampled_from(["", ".", "no_such_module", "os.", "a b", "sb3_symphony.nothing"]),
     "--device": TEXT.map(lambda text: f"no {text}"),
     "--num-threads": NO_NUMBER,
