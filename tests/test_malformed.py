@@ -67,7 +67,7 @@ COMMANDS = {
         "--seed": BAD_COUNT.filter(lambda text: text not in ("0", "-0")),
         "--fps": BAD_COUNT | st.just("1000"),
         "--width": BAD_COUNT | st.just("1") | st.just("1e6"),
-        "--output": NO_FILE | st.sampled_from(["sac.zip", "film", ".mp4/", "."]),
+        "--output": NO_FILE | st.sampled_from(["", "sac.zip", "film", ".mp4/", "."]),
     },
     "gait": SELECTION
     | {
@@ -75,7 +75,7 @@ COMMANDS = {
         "--skip": NEGATIVE | st.just("1e300"),
         "--window": NEGATIVE | st.just("0"),
         "--n-frames": BAD_COUNT.filter(lambda text: text not in ("0", "-0")) | st.just("1000"),
-        "--output": NO_FILE | st.sampled_from(["sac.zip", "figure", ".png/", "."]),
+        "--output": NO_FILE | st.sampled_from(["", "sac.zip", "figure", ".png/", "."]),
         "--json": NO_FILE | st.just("."),
     },
     "plot": {
@@ -88,7 +88,7 @@ COMMANDS = {
         "--episode-window": BAD_COUNT,
         "--mean-per": BAD_COUNT | st.just("2"),
         "--max-timesteps": BAD_COUNT | st.just("9"),
-        "--output": NO_FILE | st.sampled_from(["sac.zip", "figure", ".png/", "."]),
+        "--output": NO_FILE | st.sampled_from(["", "sac.zip", "figure", ".png/", "."]),
         "--json": NO_FILE | st.just("."),
         "--scalars": st.none(),
         "--no-such-flag": st.none() | TEXT,
@@ -142,7 +142,7 @@ COMMANDS = {
         "--conf-file": NO_FILE | st.sampled_from(["sac.zip", ".", "", "logs"]),
         "--env-kwargs": SELECTION["--env-kwargs"],
         "--log-folder": st.just("sac.zip") | st.just("sac.zip/logs") | st.just("x" * 300),
-        "--storage": st.sampled_from(["sac.zip/journal.log", "nothing://here", "."]),
+        "--storage": st.sampled_from(["", "sac.zip/journal.log", "nothing://here", "."]),
         "--heartbeat": BAD_COUNT,
         "--device": SELECTION["--device"],
         "--num-threads": NO_NUMBER,
@@ -155,7 +155,7 @@ COMMANDS = {
         "--algo": TEXT.filter(lambda text: text != "sac"),
         "--no-such-flag": st.none() | TEXT,
     },
-    "export": SELECTION | {"--output": NO_FILE | st.sampled_from(["sac.zip", "actor", ".onnx/", "."])},
+    "export": SELECTION | {"--output": NO_FILE | st.sampled_from(["", "sac.zip", "actor", ".onnx/", "."])},
 }
 
 

@@ -332,6 +332,7 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
         message = (
             first["msg"].removeprefix("Value error, ").partition(", unable to")[0].replace("Input should be", "expected", 1)
         )
+        message = message.replace("String should have", "expected")
         message = message.replace("greater than or equal to", "a number >=").replace("less than", "a number <")
         message = message.replace("a valid integer", "a whole number").replace("a valid ", "a ")
         raise ConfigError(f"{key}: {values.get(key)!r} — {message}") from None

@@ -35,7 +35,7 @@ class PlotOptions(BaseModel):
     mean_per: int | None = Field(default=None, ge=1)
     max_timesteps: int | None = Field(default=None, ge=1)
     labels: list[str] = []
-    output: str | None = None
+    output: str | None = Field(default=None, min_length=1)
     json_file: str | None = None
 
     @property

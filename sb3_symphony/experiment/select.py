@@ -303,7 +303,7 @@ class EnjoyOptions(SelectOptions):
 class ExportOptions(SelectOptions):
     """Options of ``sb3-symphony export``; their meaning is in its ``--help``."""
 
-    output: str | None = None
+    output: str | None = Field(default=None, min_length=1)
 
 
 class AgentsOptions(SelectOptions):
@@ -324,7 +324,7 @@ class AgentsOptions(SelectOptions):
     seed: int = Field(default=0, ge=0, lt=2**31)
     deterministic: bool = True
     n_timesteps: int | None = Field(default=None, ge=1)
-    output: str | None = None
+    output: str | None = Field(default=None, min_length=1)
     progress: bool = False
     num_threads: int = 1
 

@@ -51,7 +51,7 @@ class TuneOptions(BaseModel):
     n_jobs: int = Field(default=1, ge=-1)
     sampler: Literal["tpe", "random", "gp", "cmaes"] = "tpe"
     pruner: Literal["median", "halving", "hyperband", "none"] = "median"
-    storage: str | None = None
+    storage: str | None = Field(default=None, min_length=1)
     study_name: str | None = Field(default=None, min_length=1, max_length=200)
     heartbeat: int = Field(default=30, ge=1)
     device: str = "auto"
@@ -279,7 +279,7 @@ def read_space(options: TuneOptions) -> SearchSpace:
     :return: the space; its names and values are yet to be checked against the algorithm
     :raises ConfigError: if the file or one of its ranges is wrong
     """
-    path = Path(options.space or shipped_folder() / "tuning" / f"{options.algo}.yml")
+    path = Path(shipped_folder() / "tuning" / f"{options.algo}.yml" if options.space is None else options.space)
     content = read_yaml(path)
     where = str(path)
     for name in (options.env, "default"):
