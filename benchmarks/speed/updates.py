@@ -355,13 +355,17 @@ def contestants(setting: Setting) -> dict[str, Callable[[], tuple[Turn | None, T
     if setting.name == "symphony":
         constructors["ours, fused, policy_delay 2"] = partial(symphony, setting, "fused", policy_delay=2)
         return {**constructors, "SB3 TD3 (policy_delay 2)": lambda: sb3(setting, TD3)}
-    return {
-        **constructors,
+    constructors |= {
         "separate networks": lambda: separate(setting),
         "SB3 SAC": lambda: sb3(setting, n_critics=setting.n_critics),
         "SB3 SAC, our policy_delay": lambda: sb3(setting, DelayedSAC, n_critics=setting.n_critics),
         "SBX SAC": lambda: sbx(setting, delayed=False),
         "SBX SAC, our policy_delay": lambda: sbx(setting, delayed=True),
+    }
+    if setting.name in ("shape", "ensemble"):
+        return constructors
+    return {  # other algorithms, for orientation
+        **constructors,
         "SB3 TD3": lambda: sb3(setting, TD3),
         "TQC": lambda: sb3(setting, TQC, n_critics=setting.n_critics),
         "CrossQ": lambda: sb3(setting, CrossQ, n_critics=setting.n_critics),
