@@ -7,7 +7,7 @@ import yaml
 from rich.console import Console
 
 from sb3_symphony.experiment import grid_view
-from sb3_symphony.experiment.grid import Progress
+from sb3_symphony.experiment.grid_progress import Progress
 from sb3_symphony.experiment.grid_view import View, plain_table
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.study import cells_of, configuration, read_study

@@ -1,5 +1,6 @@
 """Study files: what their cells are, and one clear line for every mistake."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -264,6 +265,42 @@ def test_shipped_studies(path, quick, tmp_path, capsys):
     assert main(["bench", str(path), "--dry-run", "-f", str(tmp_path / "results"), *["--quick"] * quick]) == 0
     assert " queued" in capsys.readouterr().out.splitlines()[-1]
     assert not (tmp_path / "results").exists()
+
+
+def _has_page(study):
+    page = study.parent / "README.md"
+    return page.is_file() and "<!-- results -->" in page.read_text(encoding="utf-8")
+
+
+PAGES = [path for path in STUDIES if _has_page(path)]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.parent.name)
+def test_pages_are_made_from_the_raw_files(path, tmp_path):
+    raw, results = path.parents[2] / "results" / path.parent.name, tmp_path / "results"
+    if raw.is_dir():
+        shutil.copytree(raw, results)
+    else:  # nothing has been run
+        (results / cells_of(read_study(path), path.parent)[0].name).mkdir(parents=True)
+    written = (path.parent / "README.md").read_text(encoding="utf-8")
+    page = tmp_path / "README.md"
+    page.write_text(written, encoding="utf-8")
+    assert main(["bench", str(path), "--report", "-f", str(results), "--page", str(page)]) == 0
+    assert page.read_text(encoding="utf-8") == written
+
+
+def test_a_page_needs_its_marks(write, tmp_path, capsys):
+    path, page = write(), tmp_path / "page.md"
+    for content, message in (("", "expected one line '<!-- results -->'"), (None, "cannot be read")):
+        if content is not None:
+            page.write_text(content)
+        else:
+            page.unlink()
+        assert main(["bench", str(path), "--report", "--page", str(page)]) == 2
+        assert message in capsys.readouterr().err
+    page.write_text("<!-- results -->\n<!-- /results -->\n")
+    assert main(["bench", str(path), "--page", str(page)]) == 2
+    assert "belongs to --report" in capsys.readouterr().err
 
 
 def test_no_study_file(tmp_path):

@@ -12,7 +12,6 @@ Results lie in one folder, which holds all that is needed to go on or to make th
 """
 
 import os
-import re
 import shutil
 import threading
 import time
@@ -27,25 +26,15 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from sb3_symphony.common.files import write_atomically
-from sb3_symphony.experiment.cell import Control, Job, Outcome, begun, read_result, supervise
-from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, parse_yaml, read_yaml
+from sb3_symphony.experiment.cell import Control, Job, Outcome, supervise
+from sb3_symphony.experiment.config import ConfigError, TrainOptions
+from sb3_symphony.experiment.grid_progress import Progress, standings
+from sb3_symphony.experiment.grid_report import collect, on_page, report
 from sb3_symphony.experiment.registry import is_file, without_folder
-from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.signals import handled_by
-from sb3_symphony.experiment.study import (
-    Cell,
-    Drawing,
-    Environment,
-    Study,
-    cells_of,
-    configuration,
-    found_by,
-    read_study,
-    sweep_options,
-)
+from sb3_symphony.experiment.study import Study, found_by, read_study, sweep_options
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
-    from sb3_symphony.analysis.tables import Result
     from sb3_symphony.experiment.backends import Backend
 
 #: seconds between two signs of life for the cells
@@ -68,62 +57,6 @@ class BenchOptions(BaseModel):
     page: str | None = None
     collect: str | None = None
     dry_run: bool = False
-
-
-State = Literal["queued", "running", "done", "failed", "stopped"]
-
-
-@dataclass
-class Progress:
-    """
-    How far a cell is.
-
-    :param cell: the cell
-    :param config: its merged configuration
-    :param run: its run folder
-    :param state: of its present execution
-    :param kept: whether it was done before
-    :param reason: why it failed
-    :param steps: environment steps at the end of its latest training episode
-    :param latest: mean return of the latest ten training episodes, None before the first
-    :param since: moment and steps when it was first seen running
-    :param reported: what others have reported of it
-    """
-
-    cell: Cell
-    config: RunConfig
-    run: RunFolder
-    state: State = "queued"
-    kept: bool = False
-    reason: str = ""
-    steps: int = 0
-    latest: float | None = None
-    since: tuple[float, int] | None = None
-    reported: str = ""
-
-    @property
-    def total(self) -> int:
-        """Environment steps that it is to take."""
-        return self.config.settings.n_timesteps
-
-    @property
-    def seconds_left(self) -> float | None:
-        """Until it is done, as far as that can be told yet."""
-        if self.since is None or self.steps <= self.since[1]:
-            return None
-        return (time.monotonic() - self.since[0]) / (self.steps - self.since[1]) * (self.total - self.steps)
-
-    def look(self) -> None:
-        """Read how far the run is, from its files: they are on a file system that all machines share."""
-        from sb3_symphony.analysis.runs import read_episodes
-
-        try:
-            episodes = read_episodes(self.run.path)
-        except ValueError:  # just being written
-            return
-        if episodes is not None and len(episodes.steps):
-            self.steps = min(int(episodes.steps[-1]), self.total)
-            self.latest = float(episodes.returns[-10:].mean())
 
 
 @dataclass(frozen=True)
@@ -169,7 +102,7 @@ def bench(options: BenchOptions) -> BenchResult:
     if options.address is not None and options.backend != "ray":
         raise ConfigError(f"--address: '{options.address}' — is for --backend ray")
     if options.page is not None:
-        _on_page(options.page, "")
+        on_page(options.page, "")
     path = Path(options.study)
     for flag in ("page", "collect"):
         if getattr(options, flag) is not None and not options.report:
@@ -178,7 +111,7 @@ def bench(options: BenchOptions) -> BenchResult:
     name = path.absolute().parent.name if path.stem == "study" else path.stem
     study = study.model_copy(update={"title": study.title or name})
     folder = Path(options.folder or f"logs/bench/{name}{'_quick' if options.quick else ''}").absolute()
-    progress = _standings(study, path, folder)
+    progress = standings(study, path, folder)
     if options.dry_run:
         from sb3_symphony.experiment.grid_view import plain_table
 
@@ -191,9 +124,9 @@ def bench(options: BenchOptions) -> BenchResult:
             raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
         table = report(study, progress, folder)
         if options.page is not None:
-            write_output(Path(options.page), _on_page(options.page, table).encode(), "--page")
+            write_output(Path(options.page), on_page(options.page, table).encode(), "--page")
         if options.collect is not None:
-            _collect(progress, folder, output_folder(Path(options.collect).absolute(), "--collect"))
+            collect(progress, folder, output_folder(Path(options.collect).absolute(), "--collect"))
         return BenchResult(folder, table)
     return _run(options, study, progress, folder, path)
 
@@ -201,71 +134,6 @@ def bench(options: BenchOptions) -> BenchResult:
 # ----------------------------------------------------------------------------------------------------------------------
 # Before
 # ----------------------------------------------------------------------------------------------------------------------
-
-#: options of ``train`` that results depend on
-_DECISIVE = ("algo", "env", "seed", "eval_freq", "eval_episodes", "protocol", "threshold", "device")
-
-
-def _standings(study: Study, path: Path, folder: Path) -> list[Progress]:
-    progress = [_standing(cell, folder) for cell in cells_of(study, path.absolute().parent, folder)]
-    reported = {each.name: each.reported for each in study.algorithms}
-    for each in progress:
-        each.reported = reported[each.cell.algorithm]
-    return progress
-
-
-def _standing(cell: Cell, folder: Path) -> Progress:
-    """How far a cell is; what is there has to be of the same settings."""
-    config = configuration(cell)
-    run = RunFolder(folder / cell.name, RunFolder.file_name(cell.environment.id))
-    progress = Progress(cell, config, run)
-    if cell.waits:
-        progress.reason = f"waits for the search '{cell.sweep}'"
-        return progress
-    if not begun(run):
-        return progress
-    _check_same(progress)
-    progress.look()
-    result = read_result(run.path)
-    if result is not None and result["n_timesteps"] == progress.total and _is_evaluated(result, cell):
-        progress.state, progress.kept, progress.steps = "done", True, progress.total
-    return progress
-
-
-def _is_evaluated(result: dict[str, Any], cell: Cell) -> bool:
-    evaluations = [result.get("final", {}), *(result.get("conditions", {}).get(name, {}) for name in cell.conditions)]
-    return all(len(each.get("returns", [])) >= cell.final_episodes for each in evaluations)
-
-
-def _check_same(progress: Progress) -> None:
-    """Refuse to mix runs of one study with those of another, or of the same one before it was changed."""
-    run, cell = progress.run, progress.cell
-    stored = {"options": read_yaml(run.details / "args.yml"), "config": read_yaml(run.details / "config.yml")}
-    options = {name: getattr(cell.options, name) for name in _DECISIVE}
-    if cell.options.protocol is not None:  # settles these; the threshold too, if none is given
-        for name in ("eval_freq", "eval_episodes", *(["threshold"] if cell.options.threshold is None else [])):
-            del options[name]
-    config = parse_yaml(yaml.safe_dump(progress.config.plain), "study")
-    pairs = [(name, stored["options"].get(name), value) for name, value in options.items() if name != "algo"]
-    pairs.append(("algo", without_folder(str(stored["options"].get("algo"))), without_folder(cell.options.algo)))
-    source = cell.start_from.name if cell.start_from else None
-    pairs.append(("start_from", _place(stored["options"].get("trained_agent")), source))
-    pairs += [(name, stored["config"].get(name), config.get(name)) for name in dict.fromkeys([*stored["config"], *config])]
-    for name, there, wanted in pairs:
-        if name == "n_timesteps":
-            if there is not None and there > wanted:
-                raise ConfigError(
-                    f"{cell.name}: has {there} steps, the study {wanted} — expected as many or more, or another -f"
-                )
-        elif there != wanted:
-            raise ConfigError(
-                f"{cell.name}: was trained with {name} {there!r}, the study has {wanted!r} — expected the same, or another -f"
-            )
-
-
-def _place(run: str | None) -> str | None:
-    """A run folder, without the folder of all results, which may have moved."""
-    return run and "/".join(Path(run).parts[-2:])
 
 
 def _check_models(progress: Sequence[Progress]) -> None:
@@ -364,7 +232,7 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
                 waiting = {each.cell.name for each in progress if each.cell.waits}
                 if waiting and not interrupted:
                     interrupted = _search(study, progress, options, path, folder)
-                    now = {each.cell.name: each for each in _standings(study, path, folder)}
+                    now = {each.cell.name: each for each in standings(study, path, folder)}
                     progress = [now[each.cell.name] if each.cell.name in waiting else each for each in progress]
                     _write_settings(progress, folder, path)
                     interrupted = interrupted or _run_ready(study, progress, folder, session, backend)
@@ -519,194 +387,3 @@ class _Session:
             each.look()
             if each.state == "done":
                 each.steps = each.total
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Afterwards
-# ----------------------------------------------------------------------------------------------------------------------
-
-
-#: files of a run, and beside the runs, that a report needs or that tell what a search has found
-_RAW = ("*/args.yml", "*/config.yml", "*.monitor.csv", "evaluations.npz", "result.json")
-_RAW_BESIDE = ("settings/*_best_of_*.yml", "sweeps/*/tune/*/*.csv", "sweeps/*/tune/*/best.yml", "sweeps/*/tune/*/*.png")
-
-
-def _collect(progress: Sequence[Progress], folder: Path, target: Path) -> None:
-    """Copy what is small and worth keeping. Text loses the names of folders of this machine."""
-    if target == folder:
-        raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
-    found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
-    found += [path for pattern in _RAW_BESIDE for path in folder.glob(pattern)]
-    for path in found:
-        content = path.read_bytes()
-        if path.suffix == ".yml":
-            content = content.replace(f"{folder}/".encode(), b"").replace(str(folder).encode(), b".")
-        copy = target / path.relative_to(folder)
-        try:
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            copy.write_bytes(content)
-        except OSError as error:
-            raise ConfigError(f"--collect: '{copy}' cannot be written — {error.strerror}") from None
-
-
-_PAGE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- /results -->)", re.DOTALL)
-
-
-def _on_page(name: str, table: str) -> str:
-    """A page with the tables between its two marks."""
-    try:
-        page = Path(name).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--page: '{name}' cannot be read — {error}") from None
-    if len(_PAGE.findall(page)) != 1:
-        raise ConfigError(f"--page: '{name}' — expected one line '<!-- results -->' and, further down, '<!-- /results -->'")
-    return _PAGE.sub(lambda _: f"\n{table}\n", page)
-
-
-def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:
-    """
-    Write tables and figures of what is there.
-
-    :param study: the study, with a title
-    :param progress: all cells of the study
-    :param folder: where their run folders are, and where to write
-    :return: the Markdown tables
-    :raises ConfigError: if a file of a run is damaged, or nothing can be written
-    """
-    from sb3_symphony.analysis.matrix import matrix_rows, matrix_table, plot_matrix
-    from sb3_symphony.analysis.tables import EPISODE_COLUMNS, as_csv, episode_rows, markdown_table, run_row
-
-    try:
-        results = [_result(each) for each in progress]
-        by_environment = [
-            [each for each in results if each.environment == env]
-            for env in dict.fromkeys(each.environment for each in results)
-        ]
-        rows = [run_row(each) for each in results]
-        files = {
-            "cells.csv": as_csv(rows[0], rows),
-            "episodes.csv": as_csv(EPISODE_COLUMNS, episode_rows(results)),
-        }
-        tables = [*map(markdown_table, by_environment)]
-        if study.matrix is not None:
-            names = list(study.matrix.conditions)
-            tables += [matrix_table(some, names, study.matrix.label) for some in by_environment]
-            entries = matrix_rows(results)
-            files["matrix.csv"] = as_csv(entries[0], entries) if entries else ""
-        table = "\n".join([f"## {study.title}", "", *tables])
-        for name, content in {"table.md": table, **files}.items():
-            write_atomically(folder / name, content.encode())
-        _draw(by_environment, folder)
-        if study.matrix is not None:
-            plot_matrix(results, list(study.matrix.conditions), study.matrix.label, folder / "matrix.png")
-        _draw_figures(study, results, folder)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-    except OSError as error:
-        raise ConfigError(f"'{error.filename or folder}' cannot be written — {error.strerror}") from None
-    return table
-
-
-def _result(progress: Progress) -> "Result":
-    from sb3_symphony.analysis.runs import open_run
-    from sb3_symphony.analysis.tables import Result
-
-    run, cell = progress.run, progress.cell
-    return Result(
-        cell.algorithm,
-        cell.environment.id,
-        cell.seed,
-        _thresholds(cell.environment),
-        open_run(run.path) if (run.details / "args.yml").is_file() else None,
-        read_result(run.path) if progress.state == "done" else None,
-        progress.reported,
-    )
-
-
-def _thresholds(environment: Environment) -> Any:
-    from sb3_symphony.analysis.tables import Thresholds
-    from sb3_symphony.experiment.protocol import reward_threshold
-
-    solved = reward_threshold(environment.id) if environment.threshold is None else environment.threshold
-    below = environment.unstable_below
-    if below is None and solved is not None and solved > 0:
-        below = round(solved * 2 / 3, 6)
-    return Thresholds(solved, below)
-
-
-def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
-    """Learning curves of the runs that are done."""
-    from sb3_symphony.analysis.plots import episode_curve, evaluation_curve, plot_curves, summarised
-    from sb3_symphony.analysis.runs import NotRecorded, Run
-
-    def line(kind: str, run: Run) -> Any:
-        return evaluation_curve(run, "steps", "reward") if kind == "evaluations" else episode_curve(run, "steps", "reward", 20)
-
-    notes = {"evaluations": "mean of each evaluation's episodes", "training": "running mean of 20 training episodes"}
-    for kind, smoothed in notes.items():
-        panels: dict[str, list[Any]] = {}
-        for results in by_environment:
-            lines: dict[str, list[Any]] = {}
-            for each in results:
-                if each.run is None or each.summary is None:
-                    continue
-                try:
-                    x, y = line(kind, each.run)
-                except NotRecorded:
-                    continue
-                if len(x):
-                    lines.setdefault(each.algorithm, []).append((x, y))
-            if lines:
-                panels[results[0].environment] = [summarised(name, seeds) for name, seeds in lines.items()]
-        output = folder / f"{kind}.png"
-        if panels:
-            plot_curves(panels, "steps", "reward", smoothed, output)
-        else:
-            output.unlink(missing_ok=True)
-
-
-def _draw_figures(study: Study, results: Sequence["Result"], folder: Path) -> None:
-    """The study's own figures, of what there is to draw: a figure whose runs have not recorded it stays as it is."""
-    for name, figure in study.figures.items():
-        own = [
-            each
-            for each in results
-            if each.run is not None
-            and each.algorithm in (figure.algorithms or [each.algorithm])
-            and each.environment in (figure.environments or [each.environment])
-        ]
-        try:
-            (_draw_curves if figure.gait_at is None else _draw_gaits)(figure, own, folder / f"{name}.png")
-        except ConfigError as error:
-            print(f"{name}.png is not drawn: {error}", flush=True)
-
-
-def _draw_curves(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
-    from sb3_symphony.analysis.runs import Group
-    from sb3_symphony.experiment.plot import plot
-
-    groups: dict[tuple[str, str], Group] = {}
-    for each in results:
-        assert each.run is not None
-        group = groups.setdefault((each.algorithm, each.environment), Group(each.algorithm, each.environment, []))
-        group.runs.append(each.run)
-    plot(figure.model_copy(update={"output": str(output)}), list(groups.values()))
-
-
-def _draw_gaits(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
-    from sb3_symphony.experiment.gait import gait
-    from sb3_symphony.experiment.select import GaitOptions, checkpoints
-
-    assert figure.gait_at is not None
-    agents: dict[str, Path] = {}
-    for each in results:
-        assert each.run is not None
-        saved = checkpoints(RunFolder(each.run.path, ""))
-        episodes = each.run.episodes
-        if each.algorithm not in agents and saved and episodes is not None and len(episodes.steps) >= figure.gait_at:
-            end = int(episodes.steps[figure.gait_at - 1])
-            agents[each.algorithm] = saved[min(saved, key=lambda steps: abs(steps - end))]
-    if not agents:
-        raise ConfigError(f"no run has {figure.gait_at} episodes and the models saved around the last of them")
-    models = list(map(str, agents.values()))
-    gait(GaitOptions(agents=models, labels=list(agents), output=str(output), json_file=str(output.with_suffix(".json"))))

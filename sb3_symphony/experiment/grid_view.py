@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from sb3_symphony.experiment.grid import Progress
+    from sb3_symphony.experiment.grid_progress import Progress
 
 
 _COLUMNS = ("cell", "state", "step", "return", "time left")

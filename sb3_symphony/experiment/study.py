@@ -91,7 +91,7 @@ class Algorithm(BaseModel):
     :param seeds: seeds, which go before those of the study
     :param environments: ids of the environments it runs on, by default all
     :param start_from: agents that it starts from, by default new ones
-    :param reported: what others have reported of it, for a column of the table
+    :param reported: what others have reported of it, for a column of the table; a text, or a mapping of environments to texts
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -105,7 +105,7 @@ class Algorithm(BaseModel):
     seeds: _Seeds | None = None
     environments: _List[str] | None = None
     start_from: Annotated[Start | None, BeforeValidator(partial(_part, Start, None))] = None
-    reported: str = ""
+    reported: str | dict[str, str] = ""
 
     @field_validator("name")
     @classmethod

@@ -1,0 +1,145 @@
+"""How far the cells of a grid are, and whether what is there is of the same settings."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from sb3_symphony.experiment.cell import begun, read_result
+from sb3_symphony.experiment.config import ConfigError, RunConfig, parse_yaml, read_yaml
+from sb3_symphony.experiment.registry import without_folder
+from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.study import Cell, Study, cells_of, configuration
+
+State = Literal["queued", "running", "done", "failed", "stopped"]
+
+
+@dataclass
+class Progress:
+    """
+    How far a cell is.
+
+    :param cell: the cell
+    :param config: its merged configuration
+    :param run: its run folder
+    :param state: of its present execution
+    :param kept: whether it was done before
+    :param reason: why it failed
+    :param steps: environment steps at the end of its latest training episode
+    :param latest: mean return of the latest ten training episodes, None before the first
+    :param since: moment and steps when it was first seen running
+    :param reported: what others have reported of it
+    """
+
+    cell: Cell
+    config: RunConfig
+    run: RunFolder
+    state: State = "queued"
+    kept: bool = False
+    reason: str = ""
+    steps: int = 0
+    latest: float | None = None
+    since: tuple[float, int] | None = None
+    reported: str = ""
+
+    @property
+    def total(self) -> int:
+        """Environment steps that it is to take."""
+        return self.config.settings.n_timesteps
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Until it is done, as far as that can be told yet."""
+        if self.since is None or self.steps <= self.since[1]:
+            return None
+        return (time.monotonic() - self.since[0]) / (self.steps - self.since[1]) * (self.total - self.steps)
+
+    def look(self) -> None:
+        """Read how far the run is, from its files: they are on a file system that all machines share."""
+        from sb3_symphony.analysis.runs import read_episodes
+
+        try:
+            episodes = read_episodes(self.run.path)
+        except ValueError:  # just being written
+            return
+        if episodes is not None and len(episodes.steps):
+            self.steps = min(int(episodes.steps[-1]), self.total)
+            self.latest = float(episodes.returns[-10:].mean())
+
+
+#: options of ``train`` that results depend on
+_DECISIVE = ("algo", "env", "seed", "eval_freq", "eval_episodes", "protocol", "threshold", "device")
+
+
+def standings(study: Study, path: Path, folder: Path) -> list[Progress]:
+    """
+    All cells of a study.
+
+    :param study: the study
+    :param path: its file
+    :param folder: where results are kept
+    :return: the cells, and how far each is
+    :raises ConfigError: if a run that is there has other settings
+    """
+    progress = [_standing(cell, folder) for cell in cells_of(study, path.absolute().parent, folder)]
+    reported = {each.name: each.reported for each in study.algorithms}
+    for each in progress:
+        told = reported[each.cell.algorithm]
+        each.reported = told if isinstance(told, str) else told.get(each.cell.environment.id, "")
+    return progress
+
+
+def _standing(cell: Cell, folder: Path) -> Progress:
+    """How far a cell is; what is there has to be of the same settings."""
+    config = configuration(cell)
+    run = RunFolder(folder / cell.name, RunFolder.file_name(cell.environment.id))
+    progress = Progress(cell, config, run)
+    if cell.waits:
+        progress.reason = f"waits for the search '{cell.sweep}'"
+        return progress
+    if not begun(run):
+        return progress
+    _check_same(progress)
+    progress.look()
+    result = read_result(run.path)
+    if result is not None and result["n_timesteps"] == progress.total and _is_evaluated(result, cell):
+        progress.state, progress.kept, progress.steps = "done", True, progress.total
+    return progress
+
+
+def _is_evaluated(result: dict[str, Any], cell: Cell) -> bool:
+    evaluations = [result.get("final", {}), *(result.get("conditions", {}).get(name, {}) for name in cell.conditions)]
+    return all(len(each.get("returns", [])) >= cell.final_episodes for each in evaluations)
+
+
+def _check_same(progress: Progress) -> None:
+    """Refuse to mix runs of one study with those of another, or of the same one before it was changed."""
+    run, cell = progress.run, progress.cell
+    stored = {"options": read_yaml(run.details / "args.yml"), "config": read_yaml(run.details / "config.yml")}
+    options = {name: getattr(cell.options, name) for name in _DECISIVE}
+    if cell.options.protocol is not None:  # settles these; the threshold too, if none is given
+        for name in ("eval_freq", "eval_episodes", *(["threshold"] if cell.options.threshold is None else [])):
+            del options[name]
+    config = parse_yaml(yaml.safe_dump(progress.config.plain), "study")
+    pairs = [(name, stored["options"].get(name), value) for name, value in options.items() if name != "algo"]
+    pairs.append(("algo", without_folder(str(stored["options"].get("algo"))), without_folder(cell.options.algo)))
+    source = cell.start_from.name if cell.start_from else None
+    pairs.append(("start_from", _place(stored["options"].get("trained_agent")), source))
+    pairs += [(name, stored["config"].get(name), config.get(name)) for name in dict.fromkeys([*stored["config"], *config])]
+    for name, there, wanted in pairs:
+        if name == "n_timesteps":
+            if there is not None and there > wanted:
+                raise ConfigError(
+                    f"{cell.name}: has {there} steps, the study {wanted} — expected as many or more, or another -f"
+                )
+        elif there != wanted:
+            raise ConfigError(
+                f"{cell.name}: was trained with {name} {there!r}, the study has {wanted!r} — expected the same, or another -f"
+            )
+
+
+def _place(run: str | None) -> str | None:
+    """A run folder, without the folder of all results, which may have moved."""
+    return run and "/".join(Path(run).parts[-2:])

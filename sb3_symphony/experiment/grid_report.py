@@ -1,0 +1,217 @@
+"""What came out of a grid: tables, figures, pages, and the raw files that are worth keeping."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_symphony.common.files import write_atomically
+from sb3_symphony.experiment.cell import read_result
+from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.grid_progress import Progress
+from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.study import Drawing, Environment, Study
+
+if TYPE_CHECKING:
+    from sb3_symphony.analysis.tables import Result
+
+#: files of a run, and beside the runs, that a report needs or that tell what a search has found
+_RAW = ("*/args.yml", "*/config.yml", "*.monitor.csv", "evaluations.npz", "result.json")
+_RAW_BESIDE = ("settings/*_best_of_*.yml", "sweeps/*/tune/*/*.csv", "sweeps/*/tune/*/best.yml", "sweeps/*/tune/*/*.png")
+
+
+def collect(progress: Sequence[Progress], folder: Path, target: Path) -> None:
+    """
+    Copy what is small and worth keeping. Text loses the names of folders of this machine.
+
+    :param progress: all cells of the study
+    :param folder: where their run folders are
+    :param target: where the copies go
+    :raises ConfigError: if that is the same folder, or cannot be written
+    """
+    if target == folder:
+        raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
+    found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
+    found += [path for pattern in _RAW_BESIDE for path in folder.glob(pattern)]
+    for path in found:
+        content = path.read_bytes()
+        if path.suffix == ".yml":
+            content = content.replace(f"{folder}/".encode(), b"").replace(str(folder).encode(), b".")
+        copy = target / path.relative_to(folder)
+        try:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(content)
+        except OSError as error:
+            raise ConfigError(f"--collect: '{copy}' cannot be written — {error.strerror}") from None
+
+
+_PAGE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- /results -->)", re.DOTALL)
+
+
+def on_page(name: str, table: str) -> str:
+    """
+    A page with the tables between its two marks.
+
+    :param name: file of the page
+    :param table: the tables
+    :return: its new content
+    :raises ConfigError: if it cannot be read or has no such marks
+    """
+    try:
+        page = Path(name).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--page: '{name}' cannot be read — {error}") from None
+    if len(_PAGE.findall(page)) != 1:
+        raise ConfigError(f"--page: '{name}' — expected one line '<!-- results -->' and, further down, '<!-- /results -->'")
+    return _PAGE.sub(lambda _: f"\n{table}\n", page)
+
+
+def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:
+    """
+    Write tables and figures of what is there.
+
+    :param study: the study, with a title
+    :param progress: all cells of the study
+    :param folder: where their run folders are, and where to write
+    :return: the Markdown tables
+    :raises ConfigError: if a file of a run is damaged, or nothing can be written
+    """
+    from sb3_symphony.analysis.matrix import matrix_rows, matrix_table, plot_matrix
+    from sb3_symphony.analysis.tables import EPISODE_COLUMNS, as_csv, episode_rows, markdown_table, run_row
+
+    try:
+        results = [result_of(each) for each in progress]
+        by_environment = [
+            [each for each in results if each.environment == env]
+            for env in dict.fromkeys(each.environment for each in results)
+        ]
+        rows = [run_row(each) for each in results]
+        files = {
+            "cells.csv": as_csv(rows[0], rows),
+            "episodes.csv": as_csv(EPISODE_COLUMNS, episode_rows(results)),
+        }
+        tables = [*map(markdown_table, by_environment)]
+        if study.matrix is not None:
+            names = list(study.matrix.conditions)
+            tables += [matrix_table(some, names, study.matrix.label) for some in by_environment]
+            entries = matrix_rows(results)
+            files["matrix.csv"] = as_csv(entries[0], entries) if entries else ""
+        table = "\n".join([f"## {study.title}", "", *tables])
+        for name, content in {"table.md": table, **files}.items():
+            write_atomically(folder / name, content.encode())
+        _draw(by_environment, folder)
+        if study.matrix is not None:
+            plot_matrix(results, list(study.matrix.conditions), study.matrix.label, folder / "matrix.png")
+        _draw_figures(study, results, folder)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    except OSError as error:
+        raise ConfigError(f"'{error.filename or folder}' cannot be written — {error.strerror}") from None
+    return table
+
+
+def result_of(progress: Progress) -> "Result":
+    from sb3_symphony.analysis.runs import open_run
+    from sb3_symphony.analysis.tables import Result
+
+    run, cell = progress.run, progress.cell
+    return Result(
+        cell.algorithm,
+        cell.environment.id,
+        cell.seed,
+        _thresholds(cell.environment),
+        open_run(run.path) if (run.details / "args.yml").is_file() else None,
+        read_result(run.path) if progress.state == "done" else None,
+        progress.reported,
+    )
+
+
+def _thresholds(environment: Environment) -> Any:
+    from sb3_symphony.analysis.tables import Thresholds
+    from sb3_symphony.experiment.protocol import reward_threshold
+
+    solved = reward_threshold(environment.id) if environment.threshold is None else environment.threshold
+    below = environment.unstable_below
+    if below is None and solved is not None and solved > 0:
+        below = round(solved * 2 / 3, 6)
+    return Thresholds(solved, below)
+
+
+def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
+    """Learning curves of the runs that are done."""
+    from sb3_symphony.analysis.plots import episode_curve, evaluation_curve, plot_curves, summarised
+    from sb3_symphony.analysis.runs import NotRecorded, Run
+
+    def line(kind: str, run: Run) -> Any:
+        return evaluation_curve(run, "steps", "reward") if kind == "evaluations" else episode_curve(run, "steps", "reward", 20)
+
+    notes = {"evaluations": "mean of each evaluation's episodes", "training": "running mean of 20 training episodes"}
+    for kind, smoothed in notes.items():
+        panels: dict[str, list[Any]] = {}
+        for results in by_environment:
+            lines: dict[str, list[Any]] = {}
+            for each in results:
+                if each.run is None or each.summary is None:
+                    continue
+                try:
+                    x, y = line(kind, each.run)
+                except NotRecorded:
+                    continue
+                if len(x):
+                    lines.setdefault(each.algorithm, []).append((x, y))
+            if lines:
+                panels[results[0].environment] = [summarised(name, seeds) for name, seeds in lines.items()]
+        output = folder / f"{kind}.png"
+        if panels:
+            plot_curves(panels, "steps", "reward", smoothed, output)
+        else:
+            output.unlink(missing_ok=True)
+
+
+def _draw_figures(study: Study, results: Sequence["Result"], folder: Path) -> None:
+    """The study's own figures, of what there is to draw: a figure whose runs have not recorded it stays as it is."""
+    for name, figure in study.figures.items():
+        own = [
+            each
+            for each in results
+            if each.run is not None
+            and each.algorithm in (figure.algorithms or [each.algorithm])
+            and each.environment in (figure.environments or [each.environment])
+        ]
+        if not own:
+            continue
+        try:
+            (_draw_curves if figure.gait_at is None else _draw_gaits)(figure, own, folder / f"{name}.png")
+        except ConfigError as error:
+            print(f"{name}.png is not drawn: {error}", flush=True)
+
+
+def _draw_curves(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
+    from sb3_symphony.analysis.runs import Group
+    from sb3_symphony.experiment.plot import plot
+
+    groups: dict[tuple[str, str], Group] = {}
+    for each in results:
+        assert each.run is not None
+        group = groups.setdefault((each.algorithm, each.environment), Group(each.algorithm, each.environment, []))
+        group.runs.append(each.run)
+    plot(figure.model_copy(update={"output": str(output)}), list(groups.values()))
+
+
+def _draw_gaits(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
+    from sb3_symphony.experiment.gait import gait
+    from sb3_symphony.experiment.select import GaitOptions, checkpoints
+
+    assert figure.gait_at is not None
+    agents: dict[str, Path] = {}
+    for each in results:
+        assert each.run is not None
+        saved = checkpoints(RunFolder(each.run.path, ""))
+        episodes = each.run.episodes
+        if each.algorithm not in agents and saved and episodes is not None and len(episodes.steps) >= figure.gait_at:
+            end = int(episodes.steps[figure.gait_at - 1])
+            agents[each.algorithm] = saved[min(saved, key=lambda steps: abs(steps - end))]
+    if not agents:
+        raise ConfigError(f"no run has {figure.gait_at} episodes and the models saved around the last of them")
+    models = list(map(str, agents.values()))
+    gait(GaitOptions(agents=models, labels=list(agents), output=str(output), json_file=str(output.with_suffix(".json"))))
