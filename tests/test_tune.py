@@ -20,7 +20,7 @@ from sb3_symphony.experiment import tune as tune_module
 from sb3_symphony.experiment.config import ConfigError, RunConfig
 from sb3_symphony.experiment.space import TuneOptions
 from sb3_symphony.experiment.sweep_report import PLAN, SweepReport, reason_of
-from sb3_symphony.experiment.sweep_storage import open_storage
+from sb3_symphony.experiment.sweep_storage import JournalSweep, open_storage
 from sb3_symphony.experiment.trial import TrialFailed
 from sb3_symphony.experiment.tune import RETRIES, ProgramError, tune
 
@@ -291,6 +291,24 @@ def test_a_trial_that_another_process_has_taken_over_is_dropped(played, options,
     assert [trial.state for trial in trials] == [FAIL, *[COMPLETE] * 5]
     assert trials[1].params == trials[0].params and trials[0].value is None
     assert "trial 0: no sign of life" in capsys.readouterr().out
+
+
+def test_a_trial_that_is_taken_over_while_it_is_claimed(played, options, monkeypatch):
+    """As if the process had been asleep: meanwhile another one got the lock, and found a trial that nobody runs."""
+    beat, beats = JournalSweep.beat, []
+
+    def late(self: JournalSweep, trial_ids: list[int]) -> None:
+        beats.append(trial_ids)
+        if len(beats) == 1:
+            storage = open_storage(options().where, lambda: None, 1)
+            storage.optuna.set_trial_state_values(0, FAIL)
+            storage.close()
+        beat(self, trial_ids)
+
+    monkeypatch.setattr(JournalSweep, "beat", late)
+    tune(options())
+    trials = trials_of(options())
+    assert [trial.state for trial in trials] == [FAIL, *[COMPLETE] * 5] and len(played.started) == 5
 
 
 def test_nothing_is_written_for_a_mistake(played, options, tmp_path):

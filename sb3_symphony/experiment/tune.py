@@ -238,6 +238,8 @@ class Sweep:
         Take a trial that nobody else will take. Trials of processes that died are enqueued again before.
 
         :return: id of the trial; None if there is nothing to do
+        :raises UpdateFinishedTrialError: if this process was asleep for so long that the lock went to another one, which
+            repeats the trial
         """
         self.study.get_trials(deepcopy=False)  # what is new since the last time is read outside of the lock
         with self.storage.locked():
@@ -249,9 +251,9 @@ class Sweep:
                 running = (trial for trial in trials if trial.state == TrialState.RUNNING)
                 self._others = sum(trial._trial_id not in self._own for trial in running)
             else:
-                self._own.add(trial_id)
                 self.storage.patience(partial(self.storage.beat, [trial_id]))
                 self.storage.optuna.set_trial_user_attr(trial_id, WORKER, self.storage.worker)
+                self._own.add(trial_id)
         return trial_id
 
     def _take(self, trials: list[FrozenTrial]) -> int | None:
@@ -281,7 +283,10 @@ class Sweep:
 
     def _start(self) -> bool:
         """Claim a trial and start its trainings, if there is one."""
-        trial_id = self.claim()
+        try:
+            trial_id = self.claim()
+        except UpdateFinishedTrialError:
+            return True
         if trial_id is None:
             self._claim_at = time.monotonic() + min(5.0, self.options.heartbeat)
             return False
