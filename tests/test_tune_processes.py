@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import optuna
@@ -106,3 +107,29 @@ def test_server_that_does_not_come_back(postgres, tmp_path):  # noqa: F811
     assert sum(trial.state == COMPLETE for trial in trials) == 6
     assert [trial.value for trial in trials[:2]] == kept
     assert {reason_of(trial) for trial in trials if trial.state == FAIL} <= {"its process died"}
+
+
+def test_disk_that_fills_up(small_disk, tmp_path):
+    """The journal is waited for; once there is room, the same command goes on, with all that had been found."""
+    where, filler = small_disk / "journal.log", small_disk / "filler"
+    flags = [*small(tmp_path, 6, str(where)), "--heartbeat", "1"]
+    process = start(tmp_path, *flags)
+    line_of(process, "trial 1 ")
+    with filler.open("wb", buffering=0) as file, suppress(OSError):
+        while file.write(bytes(1024)):
+            pass
+    out, _ = process.communicate(timeout=240)
+    assert process.returncode == 2, out
+    last = out.splitlines()[-1]
+    assert f"error: {where} has been away for 20 s (No space left on device) — what it holds is kept" in last
+    before = where.read_bytes()
+    filler.unlink()
+    kept = [trial.value for trial in trials_in(str(where))[:2]]
+    assert None not in kept
+
+    process = start(tmp_path, *flags)
+    out, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, out
+    assert where.read_bytes().startswith(before)
+    trials = trials_in(str(where))
+    assert sum(trial.state == COMPLETE for trial in trials) == 6 and [trial.value for trial in trials[:2]] == kept
