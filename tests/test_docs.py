@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 
 from sb3_symphony.cli import main
-from sb3_symphony.experiment.config import shipped_folder
 
-DOCS = shipped_folder().parent / "docs"
+DOCS = Path(__file__).parents[1] / "docs"
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

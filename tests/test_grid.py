@@ -306,6 +306,12 @@ def test_two_at_once_are_refused(folder, capsys):
 
 @pytest.fixture
 def job(folder):
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [])  # a worker's is changed, and those here are in the tests' own process
+    yield _job(folder)
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _job(folder):
     options = {"algo": "td3", "env": "Pendulum-v1", "n_timesteps": 10**6, "seed": 0, "save_freq": 100, "hyperparams": SMALL}
     options |= {"num_threads": 1, "eval_freq": 0, "verbose": 0, "progress": False}
     (folder / "session").mkdir()

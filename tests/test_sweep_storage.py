@@ -10,12 +10,14 @@ from collections.abc import Callable
 
 import optuna
 import pytest
+from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
 from postgres_helpers import needs_postgres, postgres  # noqa: F401  # a fixture
+from sqlalchemy.exc import ArgumentError, OperationalError, PendingRollbackError
 from tune_helpers import kill
 
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.sweep_storage import GRACE, WORKER, StorageAway, SweepStorage, open_storage
+from sb3_symphony.experiment.sweep_storage import GRACE, WORKER, Patience, StorageAway, SweepStorage, open_storage
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -318,3 +320,31 @@ def test_trials_without_a_heartbeat_are_failed(postgres, opened):  # noqa: F811
     assert states(study) == [TrialState.FAIL, TrialState.RUNNING]
     with pytest.raises(optuna.exceptions.UpdateFinishedTrialError):
         theirs.optuna.set_trial_state_values(lost, TrialState.COMPLETE, [1.0])
+
+
+def test_a_second_try_in_a_session_that_has_lost_its_connection():
+    """What Optuna raises where the storage goes away while it reads trials."""
+    lost = OperationalError("SELECT", {}, Exception("server closed the connection unexpectedly\n\tThis probably means"))
+    calls = []
+
+    def read():
+        calls.append(1)
+        if len(calls) > 1:
+            return "read"
+        try:
+            try:
+                raise lost
+            except OperationalError:
+                raise PendingRollbackError("Can't reconnect until invalid transaction is rolled back")  # noqa: B904
+        except PendingRollbackError as error:
+            raise StorageInternalError("An exception is raised during the commit") from error
+
+    assert Patience("storage", 10, never)(read) == "read"
+
+
+def test_what_is_wrong_in_itself_is_not_waited_for():
+    def read():
+        raise StorageInternalError("An exception is raised during the commit") from ArgumentError("no such column")
+
+    with pytest.raises(StorageInternalError):
+        Patience("storage", 10, never)(read)

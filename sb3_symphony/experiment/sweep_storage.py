@@ -24,7 +24,14 @@ from optuna.exceptions import ExperimentalWarning, StorageInternalError
 from optuna.storages import JournalStorage, RDBStorage, get_storage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
-from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DBAPIError,
+    InterfaceError,
+    OperationalError,
+    PendingRollbackError,
+    SQLAlchemyError,
+)
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError
@@ -90,10 +97,11 @@ class Patience:
                 return result
 
 
-def _why_away(error: BaseException) -> str | None:
+def _why_away(error: BaseException | None) -> str | None:
     """In words; None if the storage is there and the operation itself is wrong."""
-    if isinstance(error, StorageInternalError) and error.__cause__ is not None:
-        error = error.__cause__
+    # Optuna wraps what went wrong, and its second try in a session that has lost its connection fails for that
+    while isinstance(error, StorageInternalError | PendingRollbackError):
+        error = error.__cause__ or error.__context__
     if isinstance(error, OSError):
         return error.strerror or str(error)
     lost = isinstance(error, DBAPIError) and error.connection_invalidated
