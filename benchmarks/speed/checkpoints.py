@@ -6,7 +6,8 @@ What checkpoints cost: seconds of one every 10 000 steps, beside the seconds tha
 The settings are those of the shipped YAML, with one environment. Everything that ``--save-freq`` adds is counted: the
 checkpoint, the model that is saved beside it, and the recording of episodes. Training is counted in processor time,
 checkpoints in wall-clock time, so that a machine with other work makes checkpoints look dearer than they are. Replay buffers
-are filled with random transitions up to a number of rows, of which the last 10 000 are new to each checkpoint.
+are filled with random transitions up to a number of rows, of which the last 10 000 are new to each checkpoint. Files are
+written below ``TMPDIR``, which should not be in memory.
 """
 
 import argparse
@@ -121,7 +122,7 @@ def measure(algorithm: str, steps: int, rows: list[int], times: int, recorded: f
     model: Any = build_model(options, load_config(options), seed=0, verbose=0)
     first = getattr(model, "learning_starts", 0) + 200
     found = []
-    with tempfile.TemporaryDirectory(dir=".") as folder:
+    with tempfile.TemporaryDirectory() as folder:
         clock = Clock(first)
         files = Path(folder) / "0.monitor.csv"
         files.write_text("-90.123456,1600,12345.678901\n" * 2000)  # as of two million steps
