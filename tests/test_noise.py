@@ -162,6 +162,21 @@ def test_sticky_holds():
     assert np.all(draws[:4] == draws[0]) and np.all(draws[4] != draws[0])
 
 
+def test_sticky_scale_of_each_episode():
+    np.random.seed(6)
+    noise = StickyActionNoise(2, sigma=0.4, decay="constant", episode_scale=(0.5, 1.5))
+    factors = []
+    for _ in range(4000):
+        noise.reset()
+        noise()
+        factor = noise.factor
+        np.testing.assert_allclose(noise(), 0.4 * factor * noise.x, rtol=1e-6)
+        assert noise.factor == factor  # for the whole episode
+        factors.append(factor)
+    assert 0.5 <= min(factors) < 0.51 and 1.49 < max(factors) <= 1.5
+    assert np.mean(factors) == pytest.approx(1, abs=0.02) and np.std(factors) == pytest.approx(1 / np.sqrt(12), rel=0.05)
+
+
 # Pink -----------------------------------------------------------------------------------------------------------------
 
 
@@ -274,13 +289,15 @@ def test_wrong_values(noise_class, wrong):
         (StickyActionNoise, "correlation", 1.0),
         (StickyActionNoise, "correlation", -0.5),
         (StickyActionNoise, "hold", 0),
+        (StickyActionNoise, "episode_scale", 1.5),
+        (StickyActionNoise, "episode_scale", (1.5, 0.5)),
         (PinkActionNoise, "beta", -1.0),
         (PinkActionNoise, "block_steps", 1),
         (DisturbanceActionNoise, "sigma", 2.5),
     ],
 )
 def test_wrong_own_values(noise_class, name, value):
-    with pytest.raises(ValueError, match=f"{name}={value!r}: expected"):
+    with pytest.raises(ValueError, match=re.escape(f"{name}={value!r}: expected")):
         noise_class(2, **{name: value})
 
 

@@ -147,6 +147,9 @@ class StickyActionNoise(DecayingActionNoise):
     x starts from its stationary distribution N(0, 1) at every episode, so the standard deviation is σ_t at all times.
     Correlated noise moves a robot's limbs somewhere; independent noise averages out before they have moved.
 
+    With ``episode_scale=(a, b)`` the noise of each episode is multiplied by a number drawn uniformly between them: quiet
+    episodes show what the policy is worth, loud ones something else.
+
     :param n_actions: number of action dimensions, or the action space's shape
     :param sigma: initial standard deviation, in scaled action units, >= 0
     :param sigma_final: last standard deviation, >= 0
@@ -155,8 +158,12 @@ class StickyActionNoise(DecayingActionNoise):
     :param correlation: ρ between one draw and the next, in [0, 1)
     :param hold: environment steps for which a draw is repeated, >= 1
     :param n_envs: environment steps that one call stands for (see :class:`DecayingActionNoise`)
+    :param episode_scale: smallest and largest factor of an episode, 0 <= smallest <= largest
     :raises ValueError: for a value outside the ranges above
     """
+
+    episode_scale: tuple[float, float] = (1.0, 1.0)  # of noises saved before they had it
+    factor = 1.0  # of the present episode
 
     def __init__(
         self,
@@ -168,13 +175,21 @@ class StickyActionNoise(DecayingActionNoise):
         correlation: float = 0.8,
         hold: int = 1,
         n_envs: int = 1,
+        episode_scale: tuple[float, float] = (1.0, 1.0),
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
         if not 0 <= correlation < 1:
             raise ValueError(f"correlation={correlation!r}: expected a number in [0, 1)")
         check_number("hold", hold, 1, integer=True)
+        if not isinstance(episode_scale, (tuple, list)) or len(episode_scale) != 2:
+            raise ValueError(f"episode_scale={episode_scale!r}: expected two numbers (smallest, largest)")
+        for factor in episode_scale:
+            check_number("episode_scale", factor, 0)
+        if episode_scale[0] > episode_scale[1]:
+            raise ValueError(f"episode_scale={episode_scale!r}: expected the smaller number first")
         self.correlation = correlation
         self.hold = hold
+        self.episode_scale = episode_scale
         self.reset()
 
     def reset(self) -> None:
@@ -184,13 +199,15 @@ class StickyActionNoise(DecayingActionNoise):
 
     def _draw(self, sigma: float) -> np.ndarray:
         if self.x is None:
+            smallest, largest = self.episode_scale
+            self.factor = np.random.uniform(smallest, largest) if smallest < largest else largest
             self.x = np.random.standard_normal(self.n_actions)
         elif self.held >= self.hold:
             fresh = np.random.standard_normal(self.n_actions)
             self.x = self.correlation * self.x + math.sqrt(1.0 - self.correlation**2) * fresh
             self.held = 0
         self.held += 1
-        return sigma * self.x
+        return sigma * self.factor * self.x
 
 
 class PinkActionNoise(DecayingActionNoise):

@@ -97,11 +97,11 @@ class Patience:
                 return result
 
 
-def _why_away(error: BaseException | None) -> str | None:
+def _why_away(error: BaseException) -> str | None:
     """In words; None if the storage is there and the operation itself is wrong."""
     # Optuna wraps what went wrong, and its second try in a session that has lost its connection fails for that
-    while isinstance(error, StorageInternalError | PendingRollbackError):
-        error = error.__cause__ or error.__context__
+    while isinstance(error, StorageInternalError | PendingRollbackError) and (error.__cause__ or error.__context__):
+        error = error.__cause__ or error.__context__ or error
     if isinstance(error, OSError):
         return error.strerror or str(error)
     lost = isinstance(error, DBAPIError) and error.connection_invalidated
