@@ -185,19 +185,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="JSON file")
     arguments = parser.parse_args()
 
-    rows: dict[str, Any] = {}
-    options = TuneOptions(env="Pendulum-v1", n_timesteps=20, eval_episodes=1, n_evaluations=1, hyperparams={})
-    rows["process"] = {"seconds": real_process(options)}
-    with ProcessPoolExecutor(arguments.workers, get_context("spawn")) as pool:
-        begin = time.time() + 5 * arguments.workers
-        jobs = [pool.submit(work, arguments.storage, arguments.trials, begin) for _ in range(arguments.workers)]
-        rows["together"] = summary([job.result() for job in jobs])
-    for size in arguments.sizes:
-        fill(arguments.storage, size)
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            rows[f"alone_at_{size}"] = summary([pool.submit(work, arguments.storage, size + 20, 0.0).result()])
-        print(size, json.dumps(rows[f"alone_at_{size}"]))
     packages = ("sb3-symphony", "optuna", "sqlalchemy", "psycopg", "torch")
+    rows: dict[str, Any] = {}
     record = {
         "command": f"python {Path(sys.argv[0]).as_posix()} --workers {arguments.workers} --trials {arguments.trials}",
         "storage": arguments.storage.partition(":")[0] if "://" in arguments.storage else "journal",
@@ -206,9 +195,23 @@ def main() -> None:
         "versions": {name: importlib.metadata.version(name) for name in packages},
         "rows": rows,
     }
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    arguments.output.write_text(json.dumps(record, indent=1) + "\n")
-    print(json.dumps(rows["together"], indent=1))
+
+    def add(name: str, row: dict[str, Any]) -> None:
+        rows[name] = row  # written at once: what was measured is not lost where a later part takes too long
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        arguments.output.write_text(json.dumps(record, indent=1) + "\n")
+        print(name, json.dumps(row), flush=True)
+
+    options = TuneOptions(env="Pendulum-v1", n_timesteps=20, eval_episodes=1, n_evaluations=1, hyperparams={})
+    add("process", {"seconds": real_process(options)})
+    with ProcessPoolExecutor(arguments.workers, get_context("spawn")) as pool:
+        begin = time.time() + 5 * arguments.workers
+        jobs = [pool.submit(work, arguments.storage, arguments.trials, begin) for _ in range(arguments.workers)]
+        add("together", summary([job.result() for job in jobs]))
+    for size in arguments.sizes:
+        fill(arguments.storage, size)
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            add(f"alone_at_{size}", summary([pool.submit(work, arguments.storage, size + 20, 0.0).result()]))
 
 
 if __name__ == "__main__":
