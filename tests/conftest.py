@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch as th
+from hypothesis import settings
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
@@ -18,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_symphony import REDQ, DroQ, Symphony
 
 th.set_num_threads(1)
+settings.load_profile("ci")  # the same examples every time; others: pytest --hypothesis-profile=default
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # so inherited where a shell started the tests in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
