@@ -8,7 +8,8 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
-from sb3_symphony.common.checks import check_choice
+from sb3_symphony.common.averaging import AveragedActor
+from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults, check_net_arch
 from sb3_symphony.common.regression import ENGINES
 
@@ -20,7 +21,7 @@ def xavier_(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
-class REDQPolicy(SACPolicy):
+class REDQPolicy(AveragedActor, SACPolicy):
     """
     Policy class (with both actor and critics) for REDQ and DroQ: SB3's SAC actor and an ensemble of critics.
 
@@ -45,6 +46,8 @@ class REDQPolicy(SACPolicy):
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16, twice as fast on processors that have it and less precise
+    :param actor_tau: Below 1, ``predict(..., deterministic=True)`` asks an average of the actor's weights that follows the
+        actor with this coefficient; training is the same with and without
     """
 
     critic: EnsembleCritic  # type: ignore[assignment]
@@ -72,8 +75,10 @@ class REDQPolicy(SACPolicy):
         layer_norm: bool | Sequence[bool] = False,
         dropout_rate: float = 0.0,
         critic_engine: str = "auto",
+        actor_tau: float = 1.0,
     ) -> None:
         check_choice("critic_engine", critic_engine, ENGINES)
+        check_number("actor_tau", actor_tau, 0, 1, exclusive=True)
         check_net_arch(net_arch)  # before the parent, which builds the actor
         self.critic_engine = critic_engine
         self.layer_norm, self.dropout_rate = layer_norm, dropout_rate  # before the parent, which builds the networks
@@ -95,6 +100,7 @@ class REDQPolicy(SACPolicy):
             n_critics,
             share_features_extractor,
         )
+        self.start_average(actor_tau)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
@@ -116,7 +122,8 @@ class REDQPolicy(SACPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, critic_engine=self.critic_engine)
+        data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate)
+        data.update(critic_engine=self.critic_engine, actor_tau=self.actor_tau)
         data.update(share_features_extractor=self.share_features_extractor)  # which SACPolicy leaves out
         return data
 

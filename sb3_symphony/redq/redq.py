@@ -251,6 +251,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
         self.actor.optimizer.step()
+        self.policy.average_actor()
         logs["actor_loss"].append(actor_loss.detach())
         logs["ent_coef"].append(ent_coef.mean())
 

@@ -10,7 +10,8 @@ from stable_baselines3.td3.policies import Actor as TD3Actor
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_symphony.common.checks import check_choice
+from sb3_symphony.common.averaging import AveragedActor
+from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults, hidden_layers, mlp
 from sb3_symphony.common.layers import LeakySine
 from sb3_symphony.common.regression import ENGINES
@@ -64,7 +65,7 @@ class Actor(TD3Actor):
         return data
 
 
-class SymphonyPolicy(TD3Policy):
+class SymphonyPolicy(AveragedActor, TD3Policy):
     """
     Policy class (with both actor and critics) for Symphony.
 
@@ -90,6 +91,8 @@ class SymphonyPolicy(TD3Policy):
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16, twice as fast on processors that have it and less precise
+    :param actor_tau: Below 1, ``predict(..., deterministic=True)`` asks an average of the actor's weights that follows the
+        actor with this coefficient; training is the same with and without
     """
 
     actor: Actor
@@ -115,8 +118,10 @@ class SymphonyPolicy(TD3Policy):
         dropout_rate: float = 0.0,
         leaky_slope: float = 0.1,
         critic_engine: str = "auto",
+        actor_tau: float = 1.0,
     ) -> None:
         check_choice("critic_engine", critic_engine, ENGINES)
+        check_number("actor_tau", actor_tau, 0, 1, exclusive=True)
         self.critic_engine = critic_engine
         self.layer_norm, self.dropout_rate, self.leaky_slope = layer_norm, dropout_rate, leaky_slope  # used by the parent
         super().__init__(
@@ -133,6 +138,7 @@ class SymphonyPolicy(TD3Policy):
             n_critics,
             share_features_extractor,
         )
+        self.start_average(actor_tau)
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor = self.make_actor()
@@ -174,7 +180,7 @@ class SymphonyPolicy(TD3Policy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, leaky_slope=self.leaky_slope)
-        data.update(critic_engine=self.critic_engine)
+        data.update(critic_engine=self.critic_engine, actor_tau=self.actor_tau)
         return data
 
 

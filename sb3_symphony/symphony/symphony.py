@@ -250,6 +250,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
         self.actor.optimizer.step()
+        self.policy.average_actor()
 
         value = q_values.detach().mean()
         logs["actor_loss"].append(actor_loss.detach())

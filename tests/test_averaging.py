@@ -1,0 +1,88 @@
+"""The averaged actor: what it is, who asks it, and that training does not."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from torch import nn
+
+from sb3_symphony import Symphony
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+
+
+class Actors(BaseCallback):
+    """All actors there were, one update after the other."""
+
+    def _on_training_start(self):
+        self.actors = [copy.deepcopy(self.model.actor.state_dict())]
+        update = self.model._update_actor
+
+        def recorded(*args):
+            update(*args)
+            self.actors.append(copy.deepcopy(self.model.actor.state_dict()))
+
+        self.model._update_actor = recorded
+
+    def _on_step(self):
+        return True
+
+
+def test_average(make):
+    model = make(policy_kwargs=dict(actor_tau=0.1))
+    assert not any(parameter.requires_grad for parameter in model.policy.averaged_actor.parameters())
+    actors = Actors()
+    model.learn(60, callback=actors)
+    assert len(actors.actors) > 15
+    first, *others = actors.actors
+    for name, averaged in model.policy.averaged_actor.state_dict().items():
+        expected = first[name].double()
+        for actor in others:
+            expected = 0.9 * expected + 0.1 * actor[name]
+        th.testing.assert_close(averaged.double(), expected, rtol=1e-5, atol=1e-7)
+        assert not th.equal(averaged, model.actor.state_dict()[name])
+
+
+def test_who_is_asked(make):
+    model = make(policy_kwargs=dict(actor_tau=0.1)).learn(60)
+    model.policy.set_training_mode(False)
+    inputs = th.as_tensor(OBSERVATIONS)
+    for actor, deterministic in ((model.policy.averaged_actor, True), (model.actor, False)):
+        th.manual_seed(0)
+        with th.no_grad():
+            expected = actor._predict(inputs, deterministic).numpy()
+        th.manual_seed(0)
+        actions, _ = model.predict(OBSERVATIONS, deterministic=deterministic)
+        np.testing.assert_allclose(actions, model.policy.unscale_action(expected), rtol=1e-6)
+
+
+def test_training_does_not_ask(make):
+    plain, averaged = (make(policy_kwargs=kwargs).learn(80) for kwargs in (dict(), dict(actor_tau=0.1)))
+    assert plain.policy.averaged_actor is None
+    theirs = averaged.policy.state_dict()
+    for name, value in plain.policy.state_dict().items():
+        assert th.equal(value, theirs[name]), name
+    assert {name.partition(".")[0] for name in theirs.keys() - plain.policy.state_dict().keys()} == {"averaged_actor"}
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_batch_normalisation(small, share):
+    """Statistics are those of the actor, not an average of whole numbers."""
+    import gymnasium as gym
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+
+    class Normalised(FlattenExtractor):
+        def __init__(self, observation_space: gym.Space) -> None:
+            super().__init__(observation_space)
+            self.norm = nn.BatchNorm1d(self.features_dim)
+
+        def forward(self, observations: th.Tensor) -> th.Tensor:
+            return self.norm(super().forward(observations))
+
+    kwargs = dict(actor_tau=0.1, features_extractor_class=Normalised, share_features_extractor=share)
+    model = small(Symphony, policy_kwargs=kwargs).learn(60)
+    own, averaged = (dict(actor.named_buffers()) for actor in (model.actor, model.policy.averaged_actor))
+    assert own["features_extractor.norm.num_batches_tracked"] > 0
+    assert all(th.equal(averaged[name], value) for name, value in own.items())
