@@ -247,7 +247,7 @@ def test_every_shipped_entry_fits_its_class(algo):
 @pytest.mark.parametrize("algo", ["symphony", "redq", "droq"])
 def test_every_shipped_entry_takes_the_fused_way(algo):
     for env in shipped_environments(algo):
-        model = load_algorithm(algo)(env="Pendulum-v1", device="cpu", **decode(algo, env))
+        model = load_algorithm(algo)(env=env, device="cpu", **decode(algo, env))
         assert type(model._regression) is FusedRegression, env
 
 

@@ -2,12 +2,14 @@
 Replay buffers that do not draw uniformly: fading (recent transitions more often) and prioritised (large errors more often).
 
 All of them keep Stable-Baselines3's storage, whose arrays are ``(rows, n_envs, ...)`` with ``pos`` the next row to write,
-and change only which transitions are drawn. All draws come from numpy's global generator, the one SB3 seeds.
+and change only which transitions are drawn, or show their mirror images. All draws come from numpy's global generator, the
+one SB3 seeds.
 """
 
 import copy
 import math
-from functools import lru_cache
+from collections.abc import Mapping
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_symphony.common.checks import check_number
+from sb3_symphony.common.mirror import Mirror
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Fading: weights and exact draws
@@ -111,17 +114,28 @@ def _refuse_memory_optimisation(name: str, optimize_memory_usage: bool) -> None:
 
 
 class _StepsReplayBuffer(NStepReplayBuffer):
-    """SB3's n-step buffer, except that one step gives exactly the samples of SB3's plain buffer (no discounts)."""
+    """
+    SB3's n-step buffer, except that one step gives exactly the samples of SB3's plain buffer (no discounts), and that samples
+    may be mirrored.
+    """
 
-    def __init__(self, *args: Any, n_steps: int = 1, gamma: float = 0.99, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, n_steps: int = 1, gamma: float = 0.99, mirror: Mapping[str, Any] | None = None, **kwargs: Any
+    ) -> None:
         check_number("n_steps", n_steps, 1, integer=True)
         check_number("gamma", gamma, 0, 1)
         super().__init__(*args, n_steps=n_steps, gamma=gamma, **kwargs)
+        self.mirror = None if mirror is None else Mirror(mirror, self.observation_space, self.action_space)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        if self.n_steps == 1:
-            return ReplayBuffer._get_samples(self, batch_inds, env=env)
-        return super()._get_samples(batch_inds, env=env)
+        one_step = self.n_steps == 1
+        get_samples = partial(ReplayBuffer._get_samples, self) if one_step else super()._get_samples
+        samples = get_samples(batch_inds, env=env)
+        if self.mirror is None:
+            return samples
+        if env is not None and env.norm_obs:
+            raise ValueError("mirror: expected observations as they are, not normalised ones (norm_obs=False)")
+        return self.mirror(samples)
 
 
 class _FadedSampling(ReplayBuffer):
@@ -183,6 +197,8 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
     :param gamma: discount factor of the n-step returns (unused if ``n_steps`` is 1)
     :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
     :param fade_power: power of the normalised age index, > 0
+    :param mirror: the robot's left-right symmetry, see :class:`~sb3_symphony.common.mirror.Mirror`; about every second
+        transition is shown mirrored. Not with normalised observations. ``None``: transitions as they are
     :raises ValueError: for a value outside the ranges above, Dict observations, or ``optimize_memory_usage=True``
     """
 
@@ -199,6 +215,7 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
         gamma: float = 0.99,
         fade_factor: float | None = 7.0,
         fade_power: float = 2.0,
+        mirror: Mapping[str, Any] | None = None,
     ) -> None:
         _refuse_memory_optimisation("FadingReplayBuffer", optimize_memory_usage)
         if isinstance(observation_space, spaces.Dict):
@@ -214,6 +231,7 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
             gamma=gamma,
             fade_factor=fade_factor,
             fade_power=fade_power,
+            mirror=mirror,
         )
 
 
@@ -386,6 +404,8 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
     :param alpha: exponent of the priorities, >= 0; 0 means uniform
     :param beta: exponent of the importance weights, >= 0; 1 corrects fully. An attribute: may be changed while training
     :param eps: added to each error's size, > 0, so that every transition can be drawn
+    :param mirror: the robot's left-right symmetry, see :class:`~sb3_symphony.common.mirror.Mirror`; about every second
+        transition is shown mirrored. Not with normalised observations. ``None``: transitions as they are
     :raises ValueError: for a value outside the ranges above, Dict observations, or ``optimize_memory_usage=True``
     """
 
@@ -405,6 +425,7 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
         alpha: float = 0.6,
         beta: float = 0.4,
         eps: float = 1e-6,
+        mirror: Mapping[str, Any] | None = None,
     ) -> None:
         _refuse_memory_optimisation("PrioritizedReplayBuffer", optimize_memory_usage)
         if isinstance(observation_space, spaces.Dict):
@@ -421,6 +442,7 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
             handle_timeout_termination=handle_timeout_termination,
             n_steps=n_steps,
             gamma=gamma,
+            mirror=mirror,
         )
         self.alpha = alpha
         self.beta = beta

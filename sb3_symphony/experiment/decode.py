@@ -178,7 +178,8 @@ def _numbers(value: Any) -> Iterable[float]:
             yield from _numbers(item)
     elif isinstance(value, Mapping):
         for item in value.values():
-            yield from _numbers(item)
+            if not isinstance(item, Mapping):  # what lies deeper is its owner's to check
+                yield from _numbers(item)
     elif isinstance(value, LinearSchedule):
         yield value.start
 
