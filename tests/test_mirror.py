@@ -18,11 +18,11 @@ from sb3_symphony.experiment.config import TrainOptions, load_config
 
 OBSERVATION = spaces.Box(-10, 10, (4,))
 ACTION = spaces.Box(-1, 1, (3,))
-SPEC = {"observation": {"swap": [[0, 2]], "negate": [3], "offset": {0: 0.5, 2: -0.5}}, "action": {"swap": [[0, 1]]}}
+SPEC = {"observation": {"swap": [[0, 2]], "negate": [3], "offset": [[0, 0.5], [2, -0.5]]}, "action": {"swap": [[0, 1]]}}
 
 
 def test_reflection():
-    reflection = Reflection("it", 5, swap=[[0, 2], [1, 3]], negate=[1, 3, 4], offset={0: 0.5, 2: -0.5})
+    reflection = Reflection("it", 5, swap=[[0, 2], [1, 3]], negate=[1, 3, 4], offset=[[0, 0.5], [2, -0.5]])
     vectors = th.tensor([[1.0, 2.0, 3.0, 4.0, 5.0], [0.0, 0.0, 0.0, 0.0, 1.0]])
     expected = th.tensor([[3.5, -4.0, 0.5, -2.0, -5.0], [0.5, 0.0, -0.5, 0.0, -1.0]])
     th.testing.assert_close(reflection(vectors), expected)
@@ -36,18 +36,18 @@ def test_reflection():
         (dict(swap=[[0, 4]]), r"it: index=4: expected an integer >= 0 and <= 3"),
         (dict(swap=[[0, -1]]), r"it: index=-1"),
         (dict(swap=[[0, 1.5]]), r"it: index=1.5"),
-        (dict(swap=[0, 1]), r"swap=\[0, 1\]: expected pairs of indices"),
-        (dict(swap=3), r"swap=3: expected pairs of indices"),
-        (dict(swap=[[0, 1, 2]]), "expected pairs of indices"),
+        (dict(swap=[0, 1]), r"swap=\[0, 1\]: expected a list of pairs"),
+        (dict(swap=3), r"swap=3: expected a list of pairs"),
+        (dict(swap=[[0, 1, 2]]), "expected a list of pairs"),
         (dict(swap=[[0, 1], [1, 2]]), "expected each index once"),
         (dict(swap=[[1, 1]]), "expected each index once"),
         (dict(swap=[[0, 1]], negate=[0]), "both of a pair negated or none"),
-        (dict(swap=[[0, 1]], offset={0: 0.1}), "offsets that cancel"),
-        (dict(offset={0: 0.1}), "offsets that cancel"),
-        (dict(offset=[0.1]), r"offset=\[0.1\]: expected a mapping"),
-        (dict(offset={0: float("nan")}), "it: offset of 0=nan"),
-        (dict(offset={7: 1.0}), "it: index=7"),
-        (dict(negate=2), "negate=2: expected indices"),
+        (dict(swap=[[0, 1]], offset=[[0, 0.1]]), "offsets that cancel"),
+        (dict(offset=[[0, 0.1]]), "offsets that cancel"),
+        (dict(offset=[0.1]), r"offset=\[0.1\]: expected a list of pairs"),
+        (dict(offset=[[0, float("nan")]]), "it: offset of 0=nan"),
+        (dict(offset=[[7, 1.0]]), "it: index=7"),
+        (dict(negate=2), "negate=2: expected a list of indices"),
         (dict(negate=[True]), "it: index=True"),
     ],
     ids=str,
@@ -143,6 +143,14 @@ def test_not_with_normalised_observations(make):
         make(env, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=kwargs).learn(40)
     env = VecNormalize(make_vec_env("Pendulum-v1"), norm_obs=False)
     make(env, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=kwargs).learn(40)
+
+
+def test_saved_with_the_model(make, algorithm, tmp_path):
+    """SB3 keeps arguments as JSON, whose keys are texts and whose tuples are lists."""
+    kwargs = dict(mirror={"observation": {"negate": [1, 2], "offset": [(2, 0.0)]}, "action": {"negate": (0,)}})
+    make(replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=kwargs).learn(30).save(tmp_path / "model")
+    model = algorithm.load(tmp_path / "model", env=make_vec_env("Pendulum-v1"))
+    assert model.learn(30, reset_num_timesteps=False).replay_buffer.mirror.observation.signs.tolist() == [1, -1, -1]
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])

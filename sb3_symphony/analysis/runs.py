@@ -273,7 +273,7 @@ class Group:
 def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, str]:
     flat = {}
     for key, value in config.items():
-        flat.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: str(value)})
+        flat.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": str(value)})
     return flat
 
 

@@ -19,7 +19,8 @@ class Reflection:
     :param size: number of components
     :param swap: pairs of indices: components of the left side and their counterparts on the right
     :param negate: indices of components that change sign, such as sideways velocities; of a pair, both
-    :param offset: index → what is added afterwards, for joints whose zeros differ between the sides
+    :param offset: pairs of an index and what is added to that component afterwards, for joints whose zeros differ between
+        the sides
     :raises ValueError: for an index out of range or in two pairs, or if it does not give the vector back
     :raises TypeError: if something has the wrong type
     """
@@ -30,21 +31,17 @@ class Reflection:
         size: int,
         swap: Sequence[Sequence[int]] = (),
         negate: Sequence[int] = (),
-        offset: Mapping[int, float] | None = None,
+        offset: Sequence[tuple[int, float]] = (),
     ) -> None:
-        if not isinstance(swap, Sequence) or any(not isinstance(pair, Sequence) or len(pair) != 2 for pair in swap):
-            raise TypeError(f"{name}: swap={swap!r}: expected pairs of indices, such as [[4, 9], [5, 10]]")
+        for key, pairs, example in (("swap", swap, "[[4, 9], [5, 10]]"), ("offset", offset, "[[4, 0.1], [9, -0.1]]")):
+            if not isinstance(pairs, Sequence) or any(not isinstance(pair, Sequence) or len(pair) != 2 for pair in pairs):
+                raise TypeError(f"{name}: {key}={pairs!r}: expected a list of pairs, such as {example}")
         if not isinstance(negate, Sequence):
-            raise TypeError(f"{name}: negate={negate!r}: expected indices, such as [1, 3]")
-        offset = {} if offset is None else offset
-        if not isinstance(offset, Mapping):
-            raise TypeError(
-                f"{name}: offset={offset!r}: expected a mapping of indices to numbers, such as {{4: 0.1, 9: -0.1}}"
-            )
+            raise TypeError(f"{name}: negate={negate!r}: expected a list of indices, such as [1, 3]")
         swapped = [index for pair in swap for index in pair]
-        for index in (*swapped, *negate, *offset):
+        for index in (*swapped, *negate, *(index for index, _ in offset)):
             check_number(f"{name}: index", index, 0, size - 1, integer=True)
-        for index, value in offset.items():
+        for index, value in offset:
             check_number(f"{name}: offset of {index}", value)
         if len(set(swapped)) < len(swapped):
             raise ValueError(f"{name}: swap={swap!r}: expected each index once")
@@ -55,7 +52,8 @@ class Reflection:
         self.signs = th.ones(size)
         self.signs[list(negate)] = -1
         self.offset = th.zeros(size)
-        self.offset[list(offset)] = th.tensor(list(offset.values()), dtype=th.float32)
+        for index, value in offset:
+            self.offset[index] = value
         unit = th.eye(size)
         if not th.allclose(self(self(unit)), unit, atol=1e-6):
             raise ValueError(
