@@ -29,6 +29,7 @@ INTEGERS = dict(
     n_steps=(0, -1),
     n_critics=(0, -1),
     policy_delay=(0, -1),
+    actor_batch_size=(0, -1),
 )
 NUMBERS = dict(tau=(-0.1, 1.1), gamma=(-0.1, 1.1), learning_rate=(-1e-3,))
 WRONG = (math.nan, math.inf, -math.inf, True, "3", [1])
@@ -57,8 +58,6 @@ def test_numbers(make, name, value):
         ("min_mix", "1"),
         ("target_policy_noise", -0.1),
         ("target_policy_noise", math.inf),
-        ("target_noise_clip", -1),
-        ("target_noise_clip", "0.5"),
         ("episode_gradient_steps", -1),
         ("episode_gradient_steps", 1.5),
         ("episode_gradient_steps", True),

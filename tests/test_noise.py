@@ -163,6 +163,18 @@ def test_sticky_holds():
     assert np.all(draws[:4] == draws[0]) and np.all(draws[4] != draws[0])
 
 
+def test_independent_noise_on_top():
+    """It is there in quiet episodes too, and two steps of the same draw differ by it alone."""
+    np.random.seed(0)
+    noise = StickyActionNoise(2, sigma=0.5, decay="constant", hold=2, episode_scale=(0.0, 0.0), independent=0.3)
+    quiet = series(noise, 4000)
+    assert quiet.std() == pytest.approx(0.3, rel=0.05)
+    assert abs(np.corrcoef(quiet[:-1, 0], quiet[1:, 0])[0, 1]) < 0.05
+    both = series(StickyActionNoise(2, sigma=0.5, decay="constant", hold=2, independent=0.3), 4000)
+    assert both.std() == pytest.approx(np.hypot(0.5, 0.3), rel=0.1)
+    assert (both[1::2] - both[::2]).std() == pytest.approx(0.3 * np.sqrt(2), rel=0.05)
+
+
 def test_sticky_scale_of_each_episode():
     np.random.seed(6)
     noise = StickyActionNoise(2, sigma=0.4, decay="constant", episode_scale=(0.5, 1.5))
@@ -290,6 +302,7 @@ def test_wrong_values(noise_class, wrong):
         (StickyActionNoise, "correlation", 1.0),
         (StickyActionNoise, "correlation", -0.5),
         (StickyActionNoise, "hold", 0),
+        (StickyActionNoise, "independent", -0.1),
         (StickyActionNoise, "episode_scale", 1.5),
         (StickyActionNoise, "episode_scale", (1.5, 0.5)),
         (PinkActionNoise, "beta", -1.0),

@@ -159,10 +159,14 @@ class StickyActionNoise(DecayingActionNoise):
     :param hold: environment steps for which a draw is repeated, >= 1
     :param n_envs: environment steps that one call stands for (see :class:`DecayingActionNoise`)
     :param episode_scale: smallest and largest factor of an episode, 0 <= smallest <= largest
+    :param independent: standard deviation of independent Gaussian noise on top, the same in every step, >= 0: a deterministic
+        actor's substitute for what a stochastic one tries by itself
     :raises ValueError: for a value outside the ranges above
     """
 
-    episode_scale: tuple[float, float] = (1.0, 1.0)  # of noises saved before they had it
+    # Of noises saved before they had them
+    episode_scale: tuple[float, float] = (1.0, 1.0)
+    independent = 0.0
     factor = 1.0  # of the present episode
 
     def __init__(
@@ -176,8 +180,10 @@ class StickyActionNoise(DecayingActionNoise):
         hold: int = 1,
         n_envs: int = 1,
         episode_scale: tuple[float, float] = (1.0, 1.0),
+        independent: float = 0.0,
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
+        check_number("independent", independent, 0)
         if not 0 <= correlation < 1:
             raise ValueError(f"correlation={correlation!r}: expected a number in [0, 1)")
         check_number("hold", hold, 1, integer=True)
@@ -190,6 +196,7 @@ class StickyActionNoise(DecayingActionNoise):
         self.correlation = correlation
         self.hold = hold
         self.episode_scale = episode_scale
+        self.independent = independent
         self.reset()
 
     def reset(self) -> None:
@@ -207,7 +214,8 @@ class StickyActionNoise(DecayingActionNoise):
             self.x = self.correlation * self.x + math.sqrt(1.0 - self.correlation**2) * fresh
             self.held = 0
         self.held += 1
-        return sigma * self.factor * self.x
+        noise = sigma * self.factor * self.x
+        return noise + self.independent * np.random.standard_normal(self.n_actions) if self.independent > 0 else noise
 
 
 class PinkActionNoise(DecayingActionNoise):

@@ -59,6 +59,7 @@ RESERVED = {"self", "env", "policy", "verbose", "seed", "device", "tensorboard_l
 _POLICY_RESERVED = {"self", "observation_space", "action_space", "lr_schedule", "use_sde"}
 
 _AT_LEAST_ONE = {
+    "actor_batch_size",
     "batch_size",
     "buffer_size",
     "cg_max_steps",
@@ -73,7 +74,7 @@ _AT_LEAST_ONE = {
     "target_update_interval",
     "train_freq",
 }
-_FRACTION = {"dropout_rate", "gae_lambda", "gamma", "min_mix", "tau"}
+_FRACTION = {"actor_tau", "dropout_rate", "gae_lambda", "gamma", "min_mix", "tau"}
 _ANY_SIGN = {"gradient_steps", "sde_sample_freq", "target_entropy"}
 
 

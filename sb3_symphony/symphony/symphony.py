@@ -53,11 +53,11 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param n_critics: Number of independent critics, each with its own target. Read's paper: one is the original
         algorithm, two the enhanced one; the author's code has three
     :param policy_delay: Critic updates per actor update
+    :param actor_batch_size: Transitions of an actor update, drawn for it; ``None``: the critics' last minibatch
     :param target_mode: How the critics are combined, in the target and for the actor: ``"min"``, ``"mean"`` or ``"rem"``
     :param min_mix: Weight of the minimum, the rest is on the mean
-    :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it (as in TD3;
-        not a part of Symphony, whose sources have none)
-    :param target_noise_clip: Limit of the absolute value of that noise
+    :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it, clipped at
+        2.5 standard deviations (as in TD3; not a part of Symphony, whose sources have none)
     :param critic_loss: Error function of the critics: ``"rehe"``, ``"rehe_elementwise"``, ``"huber"`` or ``"mse"``
     :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
     :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
@@ -104,10 +104,10 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         critic_learning_rate: float | Schedule | None = 7e-4,
         n_critics: int = 2,
         policy_delay: int = 1,
+        actor_batch_size: int | None = None,
         target_mode: str = "min",
         min_mix: float = 1.0,
         target_policy_noise: float = 0.0,
-        target_noise_clip: float = 0.5,
         critic_loss: str = "rehe",
         actor_loss: str = "rehae",
         initial_gradient_steps: tuple[int, int] = (64, 64),
@@ -139,6 +139,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             n_steps=n_steps,
             n_critics=n_critics,
             policy_delay=policy_delay,
+            actor_batch_size=actor_batch_size,
             target_mode=target_mode,
             critic_loss=critic_loss,
             policy_kwargs=policy_kwargs,
@@ -152,7 +153,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self.critic_learning_rate = critic_learning_rate
         self.min_mix = min_mix
         self.target_policy_noise = target_policy_noise
-        self.target_noise_clip = target_noise_clip
         self.actor_loss = actor_loss
         self.initial_gradient_steps = initial_gradient_steps
         self.episode_gradient_steps = episode_gradient_steps
@@ -162,7 +162,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             check_number("critic_learning_rate", critic_learning_rate, 0)
         check_number("min_mix", min_mix, 0, 1)
         check_number("target_policy_noise", target_policy_noise, 0)
-        check_number("target_noise_clip", target_noise_clip, 0)
         check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
         if not isinstance(initial_gradient_steps, (tuple, list)) or len(initial_gradient_steps) != 2:
             raise ValueError(f"initial_gradient_steps={initial_gradient_steps!r}: expected two numbers (uniform, faded)")
@@ -217,8 +216,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             with th.no_grad():
                 next_actions = self.actor(segment.next_observations)
                 if self.target_policy_noise > 0:
-                    noise = th.randn_like(next_actions) * self.target_policy_noise
-                    noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+                    noise = self.target_policy_noise * th.randn_like(next_actions).clamp(-2.5, 2.5)
                     next_actions = (next_actions + noise).clamp(-1, 1)
 
             for batch, next_action in zip(batches, next_actions.split(batch_size), strict=True):
@@ -240,7 +238,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
                 logs["target_q_mean"].append(target)
 
             if self._n_updates % self.policy_delay == 0:
-                self._update_actor(batches[-1], logs)
+                self._update_actor(self._actor_batch(batches[-1]), logs)
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
         """One step of the actor toward the combined critics."""
