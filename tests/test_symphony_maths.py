@@ -266,6 +266,7 @@ def test_batch_size_rule(monkeypatch, pendulum, n_envs, stored, expected):
     monkeypatch.setattr(model, "_update", lambda steps, batch_size, logs, **_: sizes.append(batch_size))
     monkeypatch.setattr(model, "_log_update", lambda *args: None)
     model.train(3)
+    model._n_updates = 1
     model.train(3, batch_size=77)
     assert sizes == [expected] * 3 + [77]
 

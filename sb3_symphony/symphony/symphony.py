@@ -174,7 +174,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
         self._redraw_actor = True  # an episode begins
         self._new_episodes = 0  # begun since the last update
-        self._initial_updates_done = False
 
         if _init_setup_model:
             self._setup_model()
@@ -200,12 +199,11 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
         n_updates_before = self._n_updates
         logs: dict[str, list[th.Tensor]] = defaultdict(list)
-        if not self._initial_updates_done:
+        if self._n_updates == 0:
             uniform, faded = self.initial_gradient_steps
             fades = isinstance(self.replay_buffer, FADING_BUFFERS)
             self._update(uniform, batch_size, logs, **({"uniform": True} if fades else {}))
             self._update(faded, batch_size, logs)
-            self._initial_updates_done = True
         self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
         self._new_episodes = 0
         self._log_update(n_updates_before, logs, noise_std(self.action_noise))

@@ -166,7 +166,7 @@ class SymphonyV3(SymphonyV2):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": V3Policy}
 
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
-        if not self._initial_updates_done:
+        if self._n_updates == 0:
             assert self.replay_buffer is not None
             # As the author has it: over the whole storage, with rows of zeros as long as it is not full
             stored = th.as_tensor(self.replay_buffer.observations[: self.replay_buffer.size()], dtype=th.float32)
