@@ -425,6 +425,34 @@ def test_both_engines_learn_the_same(small, algorithm, policy_kwargs):
         assert th.norm(weights[1][name] - value) <= 1e-3 * max(th.norm(value).item(), 1.0), name
 
 
+@pytest.mark.parametrize("actor_batch_size", [None, 40])
+def test_workspaces_are_kept(small, algorithm, monkeypatch, actor_batch_size):
+    """One for the critics' batches, one for the actor's if it has another size; never a new one while sizes stay."""
+    import sb3_symphony.common.regression as module
+
+    made = []
+    network = module.FusedNetwork
+    monkeypatch.setattr(module, "FusedNetwork", lambda *args: made.append(args[1]) or network(*args))
+    model = small(algorithm, actor_batch_size=actor_batch_size).learn(40)
+    assert sorted(made) == [16, 16] + [40] * (actor_batch_size == 40)  # critics and targets; the actor's
+    model.learn(40, reset_num_timesteps=False)
+    assert len(made) == 2 + (actor_batch_size == 40)
+
+
+def test_a_new_workspace_is_stepped_with_its_own_gradients():
+    """Also if it lies where an old one was, whose identity it then has."""
+    sizes = (24, 10, 17)
+    reference, fused = pair()
+    for i in range(UPDATES):
+        observations, actions, target = batch_of(sizes[i % 3], seed=i, dtype=th.float64)
+        for fitter in (reference, fused):
+            fitter.fit(observations, actions, target, TAU)
+        if i % 2:
+            fused._networks.clear()
+    for a, b in zip(reference.critic.parameters(), fused.critic.parameters(), strict=True):
+        th.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
 def test_gradients_of_a_fused_step_stay_out_of_grad():
     fitter = regression("fused")
     run(fitter, 2)

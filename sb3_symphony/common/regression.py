@@ -133,9 +133,9 @@ class FusedRegression(CriticRegression):
         super().__init__(critic, critic_target, loss, reduction)
         self.bfloat16 = bfloat16
         self.slope = CRITIC_LOSS_SLOPES[loss]
-        self._networks: dict[EnsembleCritic, FusedNetwork] = {}
+        self._networks: dict[EnsembleCritic, list[FusedNetwork]] = {}
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
-        self._addresses: list[int] = []  # of the optimiser's state, which they hold
+        self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])  # and addresses of the optimiser's state, both in them
 
     def fit(
         self,
@@ -166,9 +166,12 @@ class FusedRegression(CriticRegression):
             return self._network(self.critic_target, len(actions)).forward(features, actions, members)
 
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
-        network = self._networks.get(critic)
-        if network is None or not network.fits(batch_size):
-            self._networks[critic] = network = FusedNetwork(critic.q_networks, batch_size, self.bfloat16)
+        known = self._networks.get(critic, [])
+        for network in known:
+            if network.fits(batch_size):
+                return network
+        network = FusedNetwork(critic.q_networks, batch_size, self.bfloat16)
+        self._networks[critic] = [network, *known[:1]]  # the actor's batch may have another size
         return network
 
     def _step(self, network: FusedNetwork, tau: float) -> None:
@@ -179,9 +182,9 @@ class FusedRegression(CriticRegression):
             for parameter, state in zip(network.parameters, states, strict=True):
                 state["step"] = th.zeros((), dtype=th.float32)
                 state.update(exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter))
-        addresses = [id(network), *(state["exp_avg"].data_ptr() for state in states)]
-        if addresses != self._addresses:  # a state was loaded, or the batch size changed
-            self._addresses = addresses
+        swept, addresses = self._swept[0], [state["exp_avg"].data_ptr() for state in states]
+        if network is not swept or addresses != self._swept[1]:  # the batch size changed, or a state was loaded
+            self._swept = (network, addresses)
             self._sweeps = []
             targets = self.critic_target.q_networks.parameters()
             for parameter, grad, state, target in zip(network.parameters, network.grads, states, targets, strict=True):
