@@ -2,10 +2,12 @@
 
 import copy
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
 from sb3_symphony import Symphony
@@ -70,8 +72,6 @@ def test_training_does_not_ask(make):
 @pytest.mark.parametrize("share", [False, True])
 def test_batch_normalisation(small, share):
     """Statistics are those of the actor, not an average of whole numbers."""
-    import gymnasium as gym
-    from stable_baselines3.common.torch_layers import FlattenExtractor
 
     class Normalised(FlattenExtractor):
         def __init__(self, observation_space: gym.Space) -> None:

@@ -122,7 +122,7 @@ class _OtherCritics(REDQPolicy):
         :param hidden: their hidden layers
         :return: the new networks
         """
-        raise NotImplementedError
+        raise NotImplementedError  # each policy below has its own
 
 
 class SkipPolicy(_OtherCritics):
@@ -184,7 +184,7 @@ class REDQTD3(Symphony):
             members = np.random.permutation(self.n_critics)[: self.subset_size].tolist()
             return of_members(observations, actions, members)
 
-        self._regression.target_q_values = target_q_values  # type: ignore[method-assign,assignment]
+        self._regression.target_q_values = target_q_values  # type: ignore[method-assign,assignment]  # this one's
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
         actor_loss = -self._regression.q_values(batch.observations, self.actor(batch.observations)).mean()

@@ -121,7 +121,7 @@ class MinMaxExtractor(BaseFeaturesExtractor):
     """
 
     def __init__(self, observation_space: gym.Space) -> None:
-        super().__init__(observation_space, features_dim=observation_space.shape[0])  # type: ignore[index]
+        super().__init__(observation_space, features_dim=observation_space.shape[0])  # type: ignore[index]  # a vector
         self.register_buffer("low", th.full((self.features_dim,), -2.0))
         self.register_buffer("high", th.full((self.features_dim,), 2.0))
 
