@@ -175,9 +175,9 @@ def test_reduction(small, cls):
         ("n_critics", True),
         ("n_critics", "2"),
         ("n_critics", 2.5),
-        ("actor_tau", 0),
-        ("actor_tau", 1.1),
-        ("actor_tau", "0.1"),
+        ("actor_averaging", -0.1),
+        ("actor_averaging", 1.1),
+        ("actor_averaging", "0.1"),
     ],
     ids=str,
 )

@@ -33,22 +33,23 @@ class Actors(BaseCallback):
 
 
 def test_average(make):
-    model = make(policy_kwargs=dict(actor_tau=0.1))
+    model = make(policy_kwargs=dict(actor_averaging=0.3))
     assert not any(parameter.requires_grad for parameter in model.policy.averaged_actor.parameters())
     actors = Actors()
     model.learn(60, callback=actors)
     assert len(actors.actors) > 15
-    first, *others = actors.actors
+    actors = actors.actors[1:]  # the first one was not updated yet
     for name, averaged in model.policy.averaged_actor.state_dict().items():
-        expected = first[name].double()
-        for actor in others:
-            expected = 0.9 * expected + 0.1 * actor[name]
+        expected = actors[0][name].double()
+        for k, actor in enumerate(actors, start=1):
+            weight = min(1.0, 1 / (0.3 * k))
+            expected = (1 - weight) * expected + weight * actor[name]
         th.testing.assert_close(averaged.double(), expected, rtol=1e-5, atol=1e-7)
         assert not th.equal(averaged, model.actor.state_dict()[name])
 
 
 def test_who_is_asked(make):
-    model = make(policy_kwargs=dict(actor_tau=0.1)).learn(60)
+    model = make(policy_kwargs=dict(actor_averaging=0.3)).learn(60)
     model.policy.set_training_mode(False)
     inputs = th.as_tensor(OBSERVATIONS)
     for actor, deterministic in ((model.policy.averaged_actor, True), (model.actor, False)):
@@ -61,12 +62,15 @@ def test_who_is_asked(make):
 
 
 def test_training_does_not_ask(make):
-    plain, averaged = (make(policy_kwargs=kwargs).learn(80) for kwargs in (dict(), dict(actor_tau=0.1)))
+    plain, averaged = (make(policy_kwargs=kwargs).learn(80) for kwargs in (dict(), dict(actor_averaging=0.3)))
     assert plain.policy.averaged_actor is None
     theirs = averaged.policy.state_dict()
     for name, value in plain.policy.state_dict().items():
         assert th.equal(value, theirs[name]), name
-    assert {name.partition(".")[0] for name in theirs.keys() - plain.policy.state_dict().keys()} == {"averaged_actor"}
+    assert {name.partition(".")[0] for name in theirs.keys() - plain.policy.state_dict().keys()} == {
+        "averaged_actor",
+        "n_averaged",
+    }
 
 
 @pytest.mark.parametrize("share", [False, True])
@@ -81,7 +85,7 @@ def test_batch_normalisation(small, share):
         def forward(self, observations: th.Tensor) -> th.Tensor:
             return self.norm(super().forward(observations))
 
-    kwargs = dict(actor_tau=0.1, features_extractor_class=Normalised, share_features_extractor=share)
+    kwargs = dict(actor_averaging=0.3, features_extractor_class=Normalised, share_features_extractor=share)
     model = small(Symphony, policy_kwargs=kwargs).learn(60)
     own, averaged = (dict(actor.named_buffers()) for actor in (model.actor, model.policy.averaged_actor))
     assert own["features_extractor.norm.num_batches_tracked"] > 0

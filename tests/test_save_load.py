@@ -64,7 +64,7 @@ OPTIONS = {
     "prioritised": dict(replay_buffer_class=PrioritizedReplayBuffer),
     "fading": dict(replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=dict(fade_factor=3.0)),
     "dropout": dict(policy_kwargs=dict(dropout_rate=0.2, layer_norm=True)),
-    "averaged actor": dict(policy_kwargs=dict(actor_tau=0.1)),
+    "averaged actor": dict(policy_kwargs=dict(actor_averaging=0.1)),
     "AdamW": dict(policy_kwargs=dict(optimizer_class=th.optim.AdamW)),
     "SGD": dict(policy_kwargs=dict(optimizer_class=th.optim.SGD, optimizer_kwargs=dict(momentum=0.9))),
     "schedule": dict(learning_rate=lambda left: 1e-3 * left),
@@ -455,7 +455,7 @@ def test_gsde_model(small, cls, tmp_path, pendulum):
     "policy_kwargs",
     [
         dict(),
-        dict(net_arch=dict(pi=[8], qf=[16, 8]), n_critics=4, actor_tau=0.1),
+        dict(net_arch=dict(pi=[8], qf=[16, 8]), n_critics=4, actor_averaging=0.1),
         dict(layer_norm=True, dropout_rate=0.1, critic_engine="autograd", activation_fn=th.nn.Tanh),
         dict(share_features_extractor=True, optimizer_class=th.optim.AdamW, optimizer_kwargs=dict(weight_decay=0.1)),
     ],
@@ -472,7 +472,7 @@ def test_policy_alone(make, tmp_path, policy_kwargs):
         "layer_norm",
         "dropout_rate",
         "share_features_extractor",
-        "actor_tau",
+        "actor_averaging",
         "critic_engine",
     )
     for name in networks:

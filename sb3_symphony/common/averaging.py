@@ -6,38 +6,44 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
-from stable_baselines3.common.utils import polyak_update
 
 
 class AveragedActor(BasePolicy):
     """
-    Mixin, in front of SB3's ``SACPolicy`` or ``TD3Policy``: ``predict(..., deterministic=True)`` asks an exponential
-    average of the actor's weights over its last ``1 / actor_tau`` or so updates, which walks more evenly than each of them.
-    Training never asks it: with or without, the trained actor and the critics are the same.
+    Mixin, in front of SB3's ``SACPolicy`` or ``TD3Policy``: ``predict(..., deterministic=True)`` asks an average of
+    the actor's weights over the last part of its updates, which walks more evenly than each of them. The part grows with the
+    training. Training never asks it: with or without, the trained actor and the critics are the same.
 
-    Source: Polyak averaging; for policies, Nikishin et al. (2018), "Improving Stability in Deep Reinforcement Learning with
-    Weight Averaging".
+    Source: polynomial-decay averaging, Shamir & Zhang (2013), "Stochastic Gradient Descent for Non-smooth Optimization", with
+    η = 1 / part - 1; for policies, Nikishin et al. (2018), "Improving Stability in Deep Reinforcement Learning with Weight
+    Averaging".
     """
 
     actor: Any
     averaged_actor: Any  # of the actor's class, None without
+    n_averaged: th.Tensor  # (), updates so far
 
-    def start_average(self, actor_tau: float) -> None:
+    def start_average(self, actor_averaging: float) -> None:
         """
         To be called when the networks are built.
 
-        :param actor_tau: share of the actor in the average, at each of its updates; 1: no average
+        :param actor_averaging: part of all updates so far that the average reaches back; 0: no average
         """
-        self.actor_tau = actor_tau
+        self.actor_averaging = actor_averaging
         self.averaged_actor = None
-        if actor_tau < 1:
+        if actor_averaging > 0:
             self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
             del self.averaged_actor.optimizer
+            self.register_buffer("n_averaged", th.zeros((), dtype=th.long, device=self.device))
 
     def average_actor(self) -> None:
         """Move the average toward the actor; to be called after each of its updates."""
         if self.averaged_actor is not None:
-            polyak_update(self.actor.parameters(), self.averaged_actor.parameters(), self.actor_tau)
+            self.n_averaged += 1
+            weight = (1 / (self.actor_averaging * self.n_averaged)).clamp(max=1)  # of the newest actor
+            with th.no_grad():
+                for own, averaged in zip(self.actor.parameters(), self.averaged_actor.parameters(), strict=True):
+                    averaged.lerp_(own, weight)
             for own, averaged in zip(self.actor.buffers(), self.averaged_actor.buffers(), strict=True):
                 averaged.copy_(own)  # statistics of batch normalisation
 

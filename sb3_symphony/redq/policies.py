@@ -46,8 +46,8 @@ class REDQPolicy(AveragedActor, SACPolicy):
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16, twice as fast on processors that have it and less precise
-    :param actor_tau: Below 1, ``predict(..., deterministic=True)`` asks an average of the actor's weights that follows the
-        actor with this coefficient; training is the same with and without
+    :param actor_averaging: Above 0, ``predict(..., deterministic=True)`` asks an average of the actor's weights over about
+        this part of its updates so far (0.125: the last eighth); training is the same with and without
     """
 
     critic: EnsembleCritic  # type: ignore[assignment]
@@ -75,10 +75,10 @@ class REDQPolicy(AveragedActor, SACPolicy):
         layer_norm: bool | Sequence[bool] = False,
         dropout_rate: float = 0.0,
         critic_engine: str = "auto",
-        actor_tau: float = 1.0,
+        actor_averaging: float = 0.0,
     ) -> None:
         check_choice("critic_engine", critic_engine, ENGINES)
-        check_number("actor_tau", actor_tau, 0, 1, exclusive=True)
+        check_number("actor_averaging", actor_averaging, 0, 1)
         check_net_arch(net_arch)  # before the parent, which builds the actor
         self.critic_engine = critic_engine
         self.layer_norm, self.dropout_rate = layer_norm, dropout_rate  # before the parent, which builds the networks
@@ -100,7 +100,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
             n_critics,
             share_features_extractor,
         )
-        self.start_average(actor_tau)
+        self.start_average(actor_averaging)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
@@ -123,7 +123,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate)
-        data.update(critic_engine=self.critic_engine, actor_tau=self.actor_tau)
+        data.update(critic_engine=self.critic_engine, actor_averaging=self.actor_averaging)
         data.update(share_features_extractor=self.share_features_extractor)  # which SACPolicy leaves out
         return data
 

@@ -91,8 +91,8 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16, twice as fast on processors that have it and less precise
-    :param actor_tau: Below 1, ``predict(..., deterministic=True)`` asks an average of the actor's weights that follows the
-        actor with this coefficient; training is the same with and without
+    :param actor_averaging: Above 0, ``predict(..., deterministic=True)`` asks an average of the actor's weights over about
+        this part of its updates so far (0.125: the last eighth); training is the same with and without
     """
 
     actor: Actor
@@ -118,10 +118,10 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
         dropout_rate: float = 0.0,
         leaky_slope: float = 0.1,
         critic_engine: str = "auto",
-        actor_tau: float = 1.0,
+        actor_averaging: float = 0.0,
     ) -> None:
         check_choice("critic_engine", critic_engine, ENGINES)
-        check_number("actor_tau", actor_tau, 0, 1, exclusive=True)
+        check_number("actor_averaging", actor_averaging, 0, 1)
         self.critic_engine = critic_engine
         self.layer_norm, self.dropout_rate, self.leaky_slope = layer_norm, dropout_rate, leaky_slope  # used by the parent
         super().__init__(
@@ -138,7 +138,7 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
             n_critics,
             share_features_extractor,
         )
-        self.start_average(actor_tau)
+        self.start_average(actor_averaging)
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor = self.make_actor()
@@ -180,7 +180,7 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, leaky_slope=self.leaky_slope)
-        data.update(critic_engine=self.critic_engine, actor_tau=self.actor_tau)
+        data.update(critic_engine=self.critic_engine, actor_averaging=self.actor_averaging)
         return data
 
 
