@@ -29,7 +29,6 @@ INTEGERS = dict(
     n_steps=(0, -1),
     n_critics=(0, -1),
     policy_delay=(0, -1),
-    actor_batch_size=(0, -1),
 )
 NUMBERS = dict(tau=(-0.1, 1.1), gamma=(-0.1, 1.1), learning_rate=(-1e-3,))
 WRONG = (math.nan, math.inf, -math.inf, True, "3", [1])

@@ -425,18 +425,20 @@ def test_both_engines_learn_the_same(small, algorithm, policy_kwargs):
         assert th.norm(weights[1][name] - value) <= 1e-3 * max(th.norm(value).item(), 1.0), name
 
 
-@pytest.mark.parametrize("actor_batch_size", [None, 40])
-def test_workspaces_are_kept(small, algorithm, monkeypatch, actor_batch_size):
-    """One for the critics' batches, one for the actor's if it has another size; never a new one while sizes stay."""
+def test_workspaces_are_kept(small, algorithm, monkeypatch):
+    """One for the critics, one for their targets, one for another batch size; never a new one while sizes stay."""
     import sb3_symphony.common.regression as module
 
     made = []
     network = module.FusedNetwork
     monkeypatch.setattr(module, "FusedNetwork", lambda *args: made.append(args[1]) or network(*args))
-    model = small(algorithm, actor_batch_size=actor_batch_size).learn(40)
-    assert sorted(made) == [16, 16] + [40] * (actor_batch_size == 40)  # critics and targets; the actor's
+    model = small(algorithm).learn(40)
+    assert made == [16, 16]
     model.learn(40, reset_num_timesteps=False)
-    assert len(made) == 2 + (actor_batch_size == 40)
+    assert made == [16, 16]
+    for batch_size in (40, 16, 40):
+        model.train(gradient_steps=3, batch_size=batch_size)
+    assert made == [16, 16, 40, 40]
 
 
 def test_a_new_workspace_is_stepped_with_its_own_gradients():

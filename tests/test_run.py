@@ -247,15 +247,6 @@ def test_policy_delay_counts_updates_over_the_models_life(make, algorithm, gradi
     assert len(seen) >= 5
 
 
-@pytest.mark.parametrize("replay_buffer_class", [None, PrioritizedReplayBuffer])
-def test_actor_batch_size(make, replay_buffer_class):
-    model = make(actor_batch_size=40, replay_buffer_class=replay_buffer_class)
-    seen, update = [], model._update_actor
-    model._update_actor = lambda batch, *args: (seen.append(len(batch.observations)), update(batch, *args))
-    model.learn(60)
-    assert len(seen) > 10 and set(seen) == {40}
-
-
 def test_target_networks_move_at_every_update(make):
     model = make(policy_delay=1000)
     model.learn(30)

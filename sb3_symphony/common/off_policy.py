@@ -32,7 +32,6 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     :param n_critics: Number of critics; may be given in ``policy_kwargs`` instead
     :param policy_delay: Critic updates per actor update
-    :param actor_batch_size: Transitions of an actor update, drawn for it; ``None``: the critics' last minibatch
     :param target_mode: How the target combines the critics: ``"min"``, ``"mean"`` or ``"rem"``
     :param critic_loss: Error function, see :data:`sb3_symphony.common.losses.CRITIC_LOSSES`
     :param critic_reduction: ``"independent"`` (each critic meets the target) or ``"ensemble_mean"`` (their mean does)
@@ -55,7 +54,6 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         *args: Any,
         n_critics: int,
         policy_delay: int,
-        actor_batch_size: int | None,
         target_mode: str,
         critic_loss: str,
         critic_reduction: str = "independent",
@@ -75,7 +73,6 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
             raise ValueError(str(error)) from error
         self.n_critics = in_policy
         self.policy_delay = policy_delay
-        self.actor_batch_size = actor_batch_size
         self.target_mode = target_mode
         self.critic_loss = critic_loss
         self.critic_reduction = critic_reduction
@@ -99,8 +96,6 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         check_number("n_steps", self.n_steps, 1, integer=True)
         check_number("n_critics", self.n_critics, 1, integer=True)
         check_number("policy_delay", self.policy_delay, 1, integer=True)
-        if self.actor_batch_size is not None:
-            check_number("actor_batch_size", self.actor_batch_size, 1, integer=True)
         check_choice("target_mode", self.target_mode, TARGET_MODES)
         check_choice("critic_loss", self.critic_loss, CRITIC_LOSSES)
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
@@ -180,16 +175,6 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
                 yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
             gradient_steps -= draw
-
-    def _actor_batch(self, last: ReplayBufferSamples) -> ReplayBufferSamples:
-        """
-        :param last: The minibatch that the critics have just learned from
-        :return: The transitions for the actor's step
-        """
-        if self.actor_batch_size is None:
-            return last
-        assert self.replay_buffer is not None
-        return self.replay_buffer.sample(self.actor_batch_size, env=self._vec_normalize_env)
 
     def _update_priorities(self, batch: ReplayBufferSamples, target: th.Tensor, q_values: th.Tensor) -> None:
         """Priority of a transition: its error averaged over the critics. Nothing to do for other buffers."""

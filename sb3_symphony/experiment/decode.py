@@ -59,7 +59,6 @@ RESERVED = {"self", "env", "policy", "verbose", "seed", "device", "tensorboard_l
 _POLICY_RESERVED = {"self", "observation_space", "action_space", "lr_schedule", "use_sde"}
 
 _AT_LEAST_ONE = {
-    "actor_batch_size",
     "batch_size",
     "buffer_size",
     "cg_max_steps",

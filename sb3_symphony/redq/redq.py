@@ -52,7 +52,6 @@ class REDQ(EnsembleOffPolicyAlgorithm):
     :param subset_size: Size of the random subset in the target (``M``). A fraction is a random size: 1.5 means 1 or 2
         with equal probability. ``"all"`` takes the minimum over all critics
     :param policy_delay: Critic updates per update of the actor and the entropy coefficient
-    :param actor_batch_size: Transitions of an actor update, drawn for it; ``None``: the critics' last minibatch
     :param target_mode: How the target combines the critics: ``"min"`` over the subset, ``"mean"`` over all, or ``"rem"``,
         a random convex combination of all
     :param critic_loss: Error function of the critics: ``"mse"``, ``"huber"``, ``"rehe"`` or ``"rehe_elementwise"``
@@ -102,7 +101,6 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         n_critics: int = 10,
         subset_size: int | float | str = 2,
         policy_delay: int = 20,
-        actor_batch_size: int | None = None,
         target_mode: str = "min",
         critic_loss: str = "mse",
         critic_reduction: str = "independent",
@@ -137,7 +135,6 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             n_steps=n_steps,
             n_critics=n_critics,
             policy_delay=policy_delay,
-            actor_batch_size=actor_batch_size,
             target_mode=target_mode,
             critic_loss=critic_loss,
             critic_reduction=critic_reduction,
@@ -236,7 +233,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
                 logs["target_q_mean"].append(target)
 
             if self._n_updates % self.policy_delay == 0:
-                self._update_actor(self._actor_batch(batches[-1]), ent_coef, logs)
+                self._update_actor(batches[-1], ent_coef, logs)
 
         action_dist = self.actor.action_dist
         self._log_update(n_updates_before, logs, noise_std=action_dist.distribution.stddev.detach().mean())

@@ -53,7 +53,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param n_critics: Number of independent critics, each with its own target. Read's paper: one is the original
         algorithm, two the enhanced one; the author's code has three
     :param policy_delay: Critic updates per actor update
-    :param actor_batch_size: Transitions of an actor update, drawn for it; ``None``: the critics' last minibatch
     :param target_mode: How the critics are combined, in the target and for the actor: ``"min"``, ``"mean"`` or ``"rem"``
     :param min_mix: Weight of the minimum, the rest is on the mean
     :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it, clipped at
@@ -104,7 +103,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         critic_learning_rate: float | Schedule | None = 7e-4,
         n_critics: int = 2,
         policy_delay: int = 1,
-        actor_batch_size: int | None = None,
         target_mode: str = "min",
         min_mix: float = 1.0,
         target_policy_noise: float = 0.0,
@@ -139,7 +137,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             n_steps=n_steps,
             n_critics=n_critics,
             policy_delay=policy_delay,
-            actor_batch_size=actor_batch_size,
             target_mode=target_mode,
             critic_loss=critic_loss,
             policy_kwargs=policy_kwargs,
@@ -236,7 +233,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
                 logs["target_q_mean"].append(target)
 
             if self._n_updates % self.policy_delay == 0:
-                self._update_actor(self._actor_batch(batches[-1]), logs)
+                self._update_actor(batches[-1], logs)
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
         """One step of the actor toward the combined critics."""
