@@ -56,6 +56,8 @@ def test_numbers(make, name, value):
         ("min_mix", True),
         ("min_mix", "1"),
         ("target_policy_noise", -0.1),
+        ("saturation_penalty", -0.1),
+        ("saturation_penalty", math.nan),
         ("target_policy_noise", math.inf),
         ("episode_gradient_steps", -1),
         ("episode_gradient_steps", 1.5),

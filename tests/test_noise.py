@@ -166,11 +166,11 @@ def test_sticky_holds():
 def test_independent_noise_on_top():
     """It is there in quiet episodes too, and two steps of the same draw differ by it alone."""
     np.random.seed(0)
-    noise = StickyActionNoise(2, sigma=0.5, decay="constant", hold=2, episode_scale=(0.0, 0.0), independent=0.6)
+    noise = StickyActionNoise(2, sigma=0.5, decay="constant", hold=2, episode_scale=(0.0, 0.0), independent=0.3)
     quiet = series(noise, 4000)
     assert quiet.std() == pytest.approx(0.3, rel=0.05)
     assert abs(np.corrcoef(quiet[:-1, 0], quiet[1:, 0])[0, 1]) < 0.05
-    both = series(StickyActionNoise(2, sigma=0.5, decay="constant", hold=2, independent=0.6), 4000)
+    both = series(StickyActionNoise(2, sigma=0.5, decay="constant", hold=2, independent=0.3), 4000)
     assert both.std() == pytest.approx(np.hypot(0.5, 0.3), rel=0.1)
     assert (both[1::2] - both[::2]).std() == pytest.approx(0.3 * np.sqrt(2), rel=0.05)
 

@@ -235,17 +235,15 @@ def test_a_batch_seen_twice_has_no_gradient():
     assert all(parameter.grad is None for parameter in model.critic.parameters())
 
 
-def test_the_actor_gradient_is_the_policy_gradient_times_one_factor():
+def test_the_actor_gradient_is_the_policy_gradient_times_one_factor(monkeypatch):
     model, _ = model_with_data()
-    model.policy.double()
+    double_precision(model, monkeypatch)
     model.baseline = th.tensor(0.4, dtype=th.float64)
     batch = model.replay_buffer.sample(32)
-    actor = lambda obs: model.actor.mu(obs.double())  # noqa: E731
-    q_values = model.critic(batch.observations, actor(batch.observations)).amin(dim=0)
+    q_values = model.critic(batch.observations, model.actor(batch.observations)).amin(dim=0)
     plain = th.autograd.grad(q_values.mean(), list(model.actor.parameters()))
     distance = q_values.mean().item() - 0.4
     factor = math.tanh(abs(distance)) + abs(distance) / math.cosh(distance) ** 2
-    model.policy.actor.forward = actor
     model._update_actor(batch, {"actor_loss": [], "advantage": []})
     for parameter, gradient in zip(model.actor.parameters(), plain, strict=True):
         th.testing.assert_close(parameter.grad, -factor * gradient, rtol=1e-10, atol=1e-14)
@@ -409,3 +407,30 @@ def test_smoothed_target_actions(monkeypatch, noise):
     else:  # a Gaussian clipped at 2.5 standard deviations has a standard deviation of 0.986
         assert differences.abs().max().item() == pytest.approx(2.5 * noise, rel=1e-4)
         assert differences.std().item() == pytest.approx(0.986 * noise, rel=0.02) and abs(differences.mean().item()) < 0.003
+
+
+# Saturation of the actor ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1.0, 30.0])
+def test_saturation_penalty(scale):
+    """Its part of the actor's gradient is that of -log(1 - a²); where that is infinite, 2 for each unit before the tanh."""
+    gradients = []
+    for penalty in (0.0, 0.3):
+        model, _ = model_with_data(actor_loss="mean", saturation_penalty=penalty)
+        with th.no_grad():
+            model.actor.mu[-2].weight *= scale
+            model.actor.mu[-2].bias += scale - 1
+        batch = model.replay_buffer.sample(32)
+        actor = copy.deepcopy(model.actor)
+        model._update_actor(batch, {"actor_loss": [], "advantage": []})
+        gradients.append([parameter.grad.double() for parameter in model.actor.parameters()])
+    u = actor.before_tanh(batch.observations)
+    if scale == 1:
+        expected = -th.log(1 - th.tanh(u.double()) ** 2).sum(dim=1).mean()
+    else:
+        assert u.abs().min() > 10
+        expected = (2 * (u.double().abs() - math.log(2))).sum(dim=1).mean()
+    for without, with_it, part in zip(*gradients, th.autograd.grad(0.3 * expected, actor.parameters()), strict=True):
+        th.testing.assert_close(with_it - without, part.double(), rtol=1e-3, atol=1e-5)
+        assert part.abs().max() > 1e-3

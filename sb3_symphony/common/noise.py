@@ -159,8 +159,8 @@ class StickyActionNoise(DecayingActionNoise):
     :param hold: environment steps for which a draw is repeated, >= 1
     :param n_envs: environment steps that one call stands for (see :class:`DecayingActionNoise`)
     :param episode_scale: smallest and largest factor of an episode, 0 <= smallest <= largest
-    :param independent: standard deviation of independent Gaussian noise on top, in multiples of σ_t, >= 0; the same in quiet
-        and loud episodes. A deterministic actor's substitute for what a stochastic one tries by itself
+    :param independent: standard deviation of independent Gaussian noise on top, >= 0; it does not decay, and is the same in
+        quiet and loud episodes. A deterministic actor's substitute for what a stochastic one tries by itself
     :raises ValueError: for a value outside the ranges above
     """
 
@@ -214,10 +214,10 @@ class StickyActionNoise(DecayingActionNoise):
             self.x = self.correlation * self.x + math.sqrt(1.0 - self.correlation**2) * fresh
             self.held = 0
         self.held += 1
-        noise = self.factor * self.x
+        noise = sigma * self.factor * self.x
         if self.independent > 0:
             noise = noise + self.independent * np.random.standard_normal(self.n_actions)
-        return sigma * noise
+        return noise
 
 
 class PinkActionNoise(DecayingActionNoise):

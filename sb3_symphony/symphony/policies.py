@@ -5,7 +5,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor as TD3Actor
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
@@ -52,6 +52,13 @@ class Actor(TD3Actor):
         self.layer_norm, self.leaky_slope = layer_norm, leaky_slope
         hidden = hidden_layers(net_arch, activation_fn, layer_norm, leaky_slope=leaky_slope)
         self.mu = nn.Sequential(*mlp(features_dim, get_action_dim(action_space), hidden), nn.Tanh())
+
+    def before_tanh(self, obs: PyTorchObs) -> th.Tensor:
+        """
+        :param obs: Observations
+        :return: What ``forward`` takes the tangens hyperbolicus of, ``(batch, n_actions)``
+        """
+        return self.mu[:-1](self.extract_features(obs, self.features_extractor))
 
     def redraw(self) -> None:
         """New Xavier-uniform weights in every linear layer; biases and LayerNorm stay (the author's warm-up)."""

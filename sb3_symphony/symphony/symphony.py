@@ -1,3 +1,4 @@
+import math
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -8,6 +9,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from torch.nn import functional as F
 
 from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number
@@ -57,6 +59,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param min_mix: Weight of the minimum, the rest is on the mean
     :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it, clipped at
         2.5 standard deviations (as in TD3; not a part of Symphony, whose sources have none)
+    :param saturation_penalty: Weight of Σ -log(1 - a²) over the action's components in the actor's loss: near -1 and 1 the
+        gradient of the tanh vanishes, and what drifted there stays (a part of SAC's entropy; not of Symphony)
     :param critic_loss: Error function of the critics: ``"rehe"``, ``"rehe_elementwise"``, ``"huber"`` or ``"mse"``
     :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
     :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
@@ -106,6 +110,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         target_mode: str = "min",
         min_mix: float = 1.0,
         target_policy_noise: float = 0.0,
+        saturation_penalty: float = 0.0,
         critic_loss: str = "rehe",
         actor_loss: str = "rehae",
         initial_gradient_steps: tuple[int, int] = (64, 64),
@@ -150,6 +155,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self.critic_learning_rate = critic_learning_rate
         self.min_mix = min_mix
         self.target_policy_noise = target_policy_noise
+        self.saturation_penalty = saturation_penalty
         self.actor_loss = actor_loss
         self.initial_gradient_steps = initial_gradient_steps
         self.episode_gradient_steps = episode_gradient_steps
@@ -159,6 +165,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             check_number("critic_learning_rate", critic_learning_rate, 0)
         check_number("min_mix", min_mix, 0, 1)
         check_number("target_policy_noise", target_policy_noise, 0)
+        check_number("saturation_penalty", saturation_penalty, 0)
         check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
         if not isinstance(initial_gradient_steps, (tuple, list)) or len(initial_gradient_steps) != 2:
             raise ValueError(f"initial_gradient_steps={initial_gradient_steps!r}: expected two numbers (uniform, faded)")
@@ -237,9 +244,14 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
         """One step of the actor toward the combined critics."""
-        q_values = self._regression.q_values(batch.observations, self.actor(batch.observations))
+        before_tanh = self.actor.before_tanh(batch.observations)  # (batch, n_actions)
+        q_values = self._regression.q_values(batch.observations, th.tanh(before_tanh))
         q_values = combine(q_values, self.target_mode, self.min_mix)
         actor_loss = -ACTOR_LOSSES[self.actor_loss](q_values, self.baseline)
+        if self.saturation_penalty > 0:
+            # -log(1 - tanh²(u)) = 2 log cosh(u), in a form that is exact for large |u| as well
+            saturation = 2 * (before_tanh.abs() + F.softplus(-2 * before_tanh.abs()) - math.log(2))
+            actor_loss = actor_loss + self.saturation_penalty * saturation.sum(dim=1).mean()
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
         self.actor.optimizer.step()
