@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
@@ -219,3 +220,63 @@ def test_the_actor_follows_the_mean_of_all():
     logs = {"actor_loss": []}
     model._update_actor(batch, logs)
     th.testing.assert_close(logs["actor_loss"][0], expected)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Fair controls on BipedalWalker
+# ----------------------------------------------------------------------------------------------------------------------
+
+CONTROLS = STUDIES / "bipedalwalker" / "controls.py"
+
+
+@pytest.mark.parametrize(
+    ("control", "ours", "own"),
+    [
+        ("td3", "symphony", ["learning_rate", "tau", "n_timesteps", "saturation_penalty"]),
+        ("sac", "redq", ["n_timesteps", "ent_coef", "target_entropy"]),
+    ],
+)
+def test_controls_are_given_what_ours_are_given(control, ours, own):
+    theirs = yaml.safe_load((STUDIES / "bipedalwalker" / f"{control}.yml").read_text())
+    ours = yaml.safe_load((STUDIES.parents[1] / "hyperparams" / f"{ours}.yml").read_text())["BipedalWalker-v3"]
+    theirs.update(theirs["policy_kwargs"])
+    ours.update(ours["policy_kwargs"])
+    common = ["env_wrapper", "learning_starts", "batch_size", "gradient_steps", "action_noise", "net_arch", "actor_averaging"]
+    for key in [*common, *own]:
+        assert theirs.get(key) == ours.get(key), key
+    assert theirs["replay_buffer_kwargs"]["n_steps"] == ours["n_steps"]  # SB3's own argument reaches no buffer but its own
+    assert theirs["replay_buffer_kwargs"]["mirror"] == ours["replay_buffer_kwargs"]["mirror"]
+
+
+def test_saturation_penalty_of_the_control():
+    """The same step of the actor as with its loss written out."""
+    gradients = []
+    for penalty in (0.0, 0.3):
+        policy_kwargs = dict(net_arch=[8, 8], saturation_penalty=penalty, actor_averaging=0.5)
+        model = load_algorithm(f"{CONTROLS}:LayerNormTD3")("MlpPolicy", "Pendulum-v1", seed=0, policy_kwargs=policy_kwargs)
+        observations = batch_of(model).observations
+        actions = model.actor(observations)
+        loss = -model.critic.q1_forward(observations, actions).mean()
+        gradients.append(th.autograd.grad(loss, list(model.actor.parameters())))
+    before_tanh = model.actor.mu[:-1](observations)
+    own = th.autograd.grad(-0.3 * th.log(1 - th.tanh(before_tanh) ** 2).sum(dim=1).mean(), list(model.actor.parameters()))
+    # the hook answers this pass, too, with its part once more
+    for without, with_it, twice in zip(*gradients, own, strict=True):
+        th.testing.assert_close(with_it - without, twice / 2, rtol=1e-4, atol=1e-6)
+        assert twice.abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["LayerNormTD3", "LayerNormSAC"])
+def test_controls_live(name, tmp_path):
+    model = load_algorithm(f"{CONTROLS}:{name}")(
+        "MlpPolicy", "Pendulum-v1", seed=0, learning_starts=30, policy_kwargs=dict(net_arch=[8, 8], actor_averaging=0.5)
+    )
+    model.learn(60)
+    assert model.policy.n_averaged == model._n_updates
+    assert [type(layer) for layer in (model.critic.qf0 if name == "LayerNormTD3" else model.critic.qf1)].count(
+        nn.LayerNorm
+    ) == 2
+    model.save(tmp_path / "model")
+    loaded = load_algorithm(f"{CONTROLS}:{name}").load(tmp_path / "model")
+    for key, value in model.policy.state_dict().items():
+        assert th.equal(value, loaded.policy.state_dict()[key]), key
