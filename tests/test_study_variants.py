@@ -273,10 +273,17 @@ def test_controls_live(name, tmp_path):
     )
     model.learn(60)
     assert model.policy.n_averaged == model._n_updates
-    assert [type(layer) for layer in (model.critic.qf0 if name == "LayerNormTD3" else model.critic.qf1)].count(
-        nn.LayerNorm
-    ) == 2
+    for network in (model.critic.qf0, model.critic.qf1, model.critic_target.qf0):
+        assert [type(layer) for layer in network].count(nn.LayerNorm) == 2
     model.save(tmp_path / "model")
     loaded = load_algorithm(f"{CONTROLS}:{name}").load(tmp_path / "model")
     for key, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[key]), key
+
+
+@pytest.mark.parametrize("name", ALGORITHMS, ids=lambda name: name.rpartition(":")[2])
+def test_the_average_follows_actors_with_updates_of_their_own(name):
+    small = dict(learning_starts=30, buffer_size=500, batch_size=16, seed=0, device="cpu")
+    policy_kwargs = dict(net_arch=[8, 8], actor_averaging=0.5)
+    model = load_algorithm(name)("MlpPolicy", "Pendulum-v1", policy_kwargs=policy_kwargs, policy_delay=1, **small).learn(60)
+    assert model.policy.n_averaged == model._n_updates > 0

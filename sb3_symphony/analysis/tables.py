@@ -151,9 +151,10 @@ def episode_rows(results: Iterable[Result]) -> Iterator[Row]:
             assert result.summary is not None
             seeds, steps = range(final["seed"], final["seed"] + n), [result.summary["steps"]] * n
             yield from rows(result, "final", steps, seeds, final["returns"], final["lengths"], final["successes"])
-        for name, each in (result.summary or {}).get("conditions", {}).items():
+        summary = result.summary or {}
+        for name, each in summary.get("conditions", {}).items():
             n = len(each["returns"])
-            seeds, steps = range(each["seed"], each["seed"] + n), [result.summary["steps"]] * n  # type: ignore[index]
+            seeds, steps = range(each["seed"], each["seed"] + n), [summary["steps"]] * n
             yield from rows(result, f"condition {name}", steps, seeds, each["returns"], each["lengths"], each["successes"])
 
 

@@ -313,7 +313,7 @@ class SumTree:
         return {"n_leaves": self.n_leaves, "values": self.nodes[self.first_leaf : end]}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(state["n_leaves"])  # type: ignore[misc]
+        self.__init__(state["n_leaves"])  # type: ignore[misc]  # no subclass, whose own it would be
         self.nodes[self.first_leaf : self.first_leaf + len(state["values"])] = state["values"]
         level = self.first_leaf
         while level > 1:  # the same sums as in set(), hence the same bits
@@ -479,7 +479,7 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
         super().add(obs, next_obs, action, reward, done, infos)
         self.tree.set(leaves, self.max_priority**self.alpha)
 
-    def sample(  # type: ignore[override]
+    def sample(  # type: ignore[override]  # a tuple with two more fields than SB3's
         self, batch_size: int, env: VecNormalize | None = None
     ) -> PrioritizedReplayBufferSamples:
         """

@@ -50,6 +50,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
         this part of its updates so far (0.125: the last eighth); training is the same with and without
     """
 
+    # Another class of critics than SB3's annotation
     critic: EnsembleCritic  # type: ignore[assignment]
     critic_target: EnsembleCritic  # type: ignore[assignment]
     default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
@@ -109,6 +110,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
                 part.apply(xavier_)
         return actor
 
+    # SB3 annotates its own class of critics, which the ensemble stands in for
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return EnsembleCritic(**critic_kwargs, layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, init="xavier").to(

@@ -234,6 +234,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
 
             if self._n_updates % self.policy_delay == 0:
                 self._update_actor(batches[-1], ent_coef, logs)
+                self.policy.average_actor()
 
         action_dist = self.actor.action_dist
         self._log_update(n_updates_before, logs, noise_std=action_dist.distribution.stddev.detach().mean())
@@ -251,7 +252,6 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
         self.actor.optimizer.step()
-        self.policy.average_actor()
         logs["actor_loss"].append(actor_loss.detach())
         logs["ent_coef"].append(ent_coef.mean())
 

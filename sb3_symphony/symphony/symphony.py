@@ -241,6 +241,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
             if self._n_updates % self.policy_delay == 0:
                 self._update_actor(batches[-1], logs)
+                self.policy.average_actor()
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
         """One step of the actor toward the combined critics."""
@@ -250,12 +251,12 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         actor_loss = -ACTOR_LOSSES[self.actor_loss](q_values, self.baseline)
         if self.saturation_penalty > 0:
             # -log(1 - tanh²(u)) = 2 log cosh(u), in a form that is exact for large |u| as well
-            saturation = 2 * (before_tanh.abs() + F.softplus(-2 * before_tanh.abs()) - math.log(2))
+            magnitude = before_tanh.abs()
+            saturation = 2 * (magnitude + F.softplus(-2 * magnitude) - math.log(2))
             actor_loss = actor_loss + self.saturation_penalty * saturation.sum(dim=1).mean()
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
         self.actor.optimizer.step()
-        self.policy.average_actor()
 
         value = q_values.detach().mean()
         logs["actor_loss"].append(actor_loss.detach())

@@ -110,6 +110,7 @@ class BatchNormMLP(nn.Module):
 class _OtherCritics(REDQPolicy):
     """A policy whose critics are other networks. They are fitted by plain autograd, as the fused passes do not know them."""
 
+    # SB3 annotates its own class of critics, which the ensemble stands in for
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
         critic = super().make_critic(features_extractor)
         hidden = hidden_layers(self.critic_kwargs["net_arch"], self.activation_fn, self.layer_norm, self.dropout_rate)
