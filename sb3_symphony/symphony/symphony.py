@@ -1,4 +1,3 @@
-import math
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -20,6 +19,8 @@ from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgo
 from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
 
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
+
+SATURATED = 1.5  # before the tanh, whose slope there is 0.18
 
 
 class Symphony(EnsembleOffPolicyAlgorithm):
@@ -59,8 +60,10 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param min_mix: Weight of the minimum, the rest is on the mean
     :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it, clipped at
         2.5 standard deviations (as in TD3; not a part of Symphony, whose sources have none)
-    :param saturation_penalty: Weight of Σ -log(1 - a²) over the action's components in the actor's loss: near -1 and 1 the
-        gradient of the tanh vanishes, and what drifted there stays (a part of SAC's entropy; not of Symphony)
+    :param saturation_penalty: Weight of Σ max(0, abs(u) - 1.5)² in the actor's loss, u being the action's components before
+        the tanh: beyond (actions of 0.9) its gradient vanishes, and what drifted there stays. Smaller actions cost nothing:
+        a pull toward zero teaches standing still (not a part of Symphony; Wang et al. 2020, "Striving for Simplicity and
+        Performance in Off-Policy DRL", show that this is what SAC's entropy is for)
     :param critic_loss: Error function of the critics: ``"rehe"``, ``"rehe_elementwise"``, ``"huber"`` or ``"mse"``
     :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
     :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
@@ -250,10 +253,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         q_values = combine(q_values, self.target_mode, self.min_mix)
         actor_loss = -ACTOR_LOSSES[self.actor_loss](q_values, self.baseline)
         if self.saturation_penalty > 0:
-            # -log(1 - tanh²(u)) = 2 log cosh(u), in a form that is exact for large |u| as well
-            magnitude = before_tanh.abs()
-            saturation = 2 * (magnitude + F.softplus(-2 * magnitude) - math.log(2))
-            actor_loss = actor_loss + self.saturation_penalty * saturation.sum(dim=1).mean()
+            excess = F.relu(before_tanh.abs() - SATURATED)  # (batch, n_actions)
+            actor_loss = actor_loss + self.saturation_penalty * excess.square().sum(dim=1).mean()
         self.actor.optimizer.zero_grad()
         actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
         self.actor.optimizer.step()

@@ -16,6 +16,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
 from sb3_symphony.common.averaging import AveragedActor
+from sb3_symphony.symphony.symphony import SATURATED
 
 
 def _normalized(critic: ContinuousCritic, net_arch: list[int], activation_fn: type[nn.Module]) -> ContinuousCritic:
@@ -53,7 +54,8 @@ class LayerNormTD3Policy(_Averaged, TD3Policy):
         def penalise(module: nn.Module, inputs: tuple[th.Tensor, ...], before_tanh: th.Tensor) -> None:
             """Symphony's ``saturation_penalty``, added to the gradient, as TD3 makes its loss in the middle of ``train``."""
             if before_tanh.requires_grad:
-                slope = 2 * th.tanh(before_tanh.detach()) / len(before_tanh)  # of the mean of -log(1 - a²)
+                before = before_tanh.detach()
+                slope = 2 * (before - before.clamp(-SATURATED, SATURATED)) / len(before)  # of the mean of the squared excess
                 before_tanh.register_hook(lambda gradient: gradient + self.saturation_penalty * slope)
 
         actor.mu[-2].register_forward_hook(penalise)
