@@ -126,7 +126,7 @@ def _draw(figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Seque
     at = positions(names)
     for index, entries in enumerate(rows.values()):
         known = [i for i, each in enumerate(entries) if each is not None]
-        spread = [entries[i].std() for i in known]  # type: ignore[union-attr]  # only those that are known
+        spread = [each.std() for each in entries if each is not None]
         style = line_style(index)
         lines.errorbar(at[known], means[index, known], spread, **style, marker="o", markersize=3, elinewidth=0.6, capsize=2)
     lines.set_xticks(at, names)

@@ -3,6 +3,7 @@ What Borowiecki (2023), "The Ministry of Silly Walks", tried in the critics of R
 TD3, which he left for later. Names for ``algo``: ``redq_variants.py:SkipREDQ`` and so on.
 """
 
+from abc import abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -117,13 +118,13 @@ class _OtherCritics(REDQPolicy):
         critic.q_networks = self.networks(critic, hidden).to(self.device)
         return critic
 
+    @abstractmethod
     def networks(self, critic: EnsembleCritic, hidden: list) -> nn.Module:
         """
         :param critic: critics, whose networks are to be replaced
         :param hidden: their hidden layers
         :return: the new networks
         """
-        raise NotImplementedError  # each policy below has its own
 
 
 class SkipPolicy(_OtherCritics):
@@ -185,7 +186,7 @@ class REDQTD3(Symphony):
             members = np.random.permutation(self.n_critics)[: self.subset_size].tolist()
             return of_members(observations, actions, members)
 
-        self._regression.target_q_values = target_q_values  # type: ignore[method-assign,assignment]  # this one's
+        self._regression.target_q_values = target_q_values  # type: ignore[method-assign,assignment]  # of this regression alone
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
         actor_loss = -self._regression.q_values(batch.observations, self.actor(batch.observations)).mean()
