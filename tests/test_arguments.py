@@ -158,6 +158,11 @@ def test_choices(make, name, value, nearest):
         assert f"did you mean '{nearest}'?" in message
 
 
+def test_what_the_actor_follows(small):
+    message = refused(lambda **kwargs: small(Symphony, **kwargs), "actor_mode", "maen", ValueError)
+    assert "did you mean 'mean'?" in message
+
+
 @pytest.mark.parametrize("cls", [REDQ, DroQ])
 def test_reduction(small, cls):
     message = refused(lambda **kwargs: small(cls, **kwargs), "critic_reduction", "ensemble_men", ValueError)

@@ -66,7 +66,7 @@ def rectified_huber_asymmetric(advantages, elementwise):
 class SlowSymphony:
     """One update as the reference orders it: targets' average, target, critics, actor, baseline."""
 
-    def __init__(self, model, critic_rate=7e-4, actor_rate=3e-4, min_mix=1.0, elementwise=False, delay=1):
+    def __init__(self, model, critic_rate=7e-4, actor_rate=3e-4, min_mix=1.0, actor_mix=None, elementwise=False, delay=1):
         self.critics = separate_networks(model.critic.q_networks)
         self.targets = separate_networks(model.critic_target.q_networks)
         self.actor = copy.deepcopy(model.actor.mu)
@@ -74,12 +74,13 @@ class SlowSymphony:
         parameters = [parameter for critic in self.critics for parameter in critic.parameters()]
         self.critic_optimizer = th.optim.Adam(parameters, lr=critic_rate)
         self.actor_optimizer = th.optim.Adam(self.actor.parameters(), lr=actor_rate)
-        self.min_mix, self.elementwise, self.delay = min_mix, elementwise, delay
+        self.min_mix, self.actor_mix = min_mix, min_mix if actor_mix is None else actor_mix
+        self.elementwise, self.delay = elementwise, delay
         self.n_updates = 0
 
-    def combined(self, networks, obs, actions):
+    def combined(self, networks, obs, actions, mix):
         values = th.stack([network(th.cat([obs, actions], dim=1)) for network in networks])
-        return self.min_mix * values.amin(dim=0) + (1 - self.min_mix) * values.mean(dim=0)
+        return mix * values.amin(dim=0) + (1 - mix) * values.mean(dim=0)
 
     def move_targets(self):
         with th.no_grad():
@@ -90,7 +91,8 @@ class SlowSymphony:
     def update(self, obs, actions, next_obs, dones, rewards):
         self.move_targets()
         with th.no_grad():
-            y = rewards + GAMMA * (1 - dones) * self.combined(self.targets, next_obs, self.actor(next_obs))
+            next_values = self.combined(self.targets, next_obs, self.actor(next_obs), self.min_mix)
+            y = rewards + GAMMA * (1 - dones) * next_values
         x = th.cat([obs, actions], dim=1)
         self.critic_optimizer.zero_grad()
         sum(rectified_huber(y - critic(x), self.elementwise) for critic in self.critics).backward()
@@ -98,7 +100,7 @@ class SlowSymphony:
 
         self.n_updates += 1
         if self.n_updates % self.delay == 0:
-            q_values = self.combined(self.critics, obs, self.actor(obs))
+            q_values = self.combined(self.critics, obs, self.actor(obs), self.actor_mix)
             self.actor_optimizer.zero_grad()
             (-rectified_huber_asymmetric(q_values - self.baseline, self.elementwise)).backward()
             self.actor_optimizer.step()
@@ -111,6 +113,8 @@ VARIANTS = {
     "default": ({}, {}),
     "min_mix": (dict(min_mix=0.7, n_critics=3), dict(min_mix=0.7)),
     "mean": (dict(target_mode="mean", n_critics=3), dict(min_mix=0.0)),
+    "actor's mean": (dict(actor_mode="mean"), dict(actor_mix=0.0)),
+    "actor's minimum": (dict(target_mode="mean", actor_mode="min"), dict(min_mix=0.0, actor_mix=1.0)),
     "elementwise": (dict(critic_loss="rehe_elementwise", actor_loss="rehae_elementwise"), dict(elementwise=True)),
     "one critic": (dict(n_critics=1), {}),
     "delay": (dict(policy_delay=2), dict(delay=2)),
