@@ -242,6 +242,14 @@ def test_fade_factor(make, fade_factor):
         make(replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=dict(fade_factor=fade_factor))
 
 
+@pytest.mark.parametrize(
+    "name, value", [("start_share", -0.1), ("start_share", 1.5), ("start_steps", 0), ("start_steps", 2.5)]
+)
+def test_share_of_first_steps(make, name, value):
+    with pytest.raises((ValueError, TypeError), match=name):
+        make(replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs={name: value})
+
+
 def test_her_needs_dict_observations(make):
     with pytest.raises((ValueError, TypeError, AssertionError)):
         make(replay_buffer_class=HerReplayBuffer)

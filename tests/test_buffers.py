@@ -1,5 +1,6 @@
 import copy
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,6 +25,9 @@ from sb3_symphony.common.buffers import (
 OBS = spaces.Box(-1e6, 1e6, (2,), np.float32)
 ACT = spaces.Box(-1, 1, (1,), np.float32)
 DICT_OBS = spaces.Dict({"a": spaces.Box(-1e6, 1e6, (2,), np.float32), "b": spaces.Box(-1e6, 1e6, (1,), np.float32)})
+
+
+STARTS = partial(FadingReplayBuffer, start_share=0.2, start_steps=3)
 
 
 def fill(buffer, n_steps, dones=None, timeouts=None):
@@ -190,6 +194,47 @@ def test_uniform_equals_sb3_draw_for_draw():
     assert batches[0].discounts is None and batches[4].discounts is not None
 
 
+@pytest.mark.parametrize("fade_factor", [7.0, None])
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("stored", [3, 20, 29, 53])
+def test_share_of_episodes_first_steps(stored, n_envs, fade_factor):
+    """Each draw comes with probability ½ from the first two steps of episodes, which fade by their own order."""
+    rows, share, start_steps = 20, 0.5, 2
+    dones = np.random.default_rng(stored).random((stored, n_envs)) < 0.2
+    buffer = FadingReplayBuffer(
+        rows * n_envs, OBS, ACT, n_envs=n_envs, fade_factor=fade_factor, start_share=share, start_steps=start_steps
+    )
+    fill(buffer, stored, dones.astype(float))
+
+    first = max(stored - rows, 0)  # the oldest step still there
+    expected = np.repeat(fade_weights(stored - first, fade_factor)[:, None], n_envs, axis=1) / n_envs
+    starts = []  # (step, environment), oldest first
+    for step in range(first, stored):
+        for env in range(n_envs):
+            if any(done == -1 or dones[done, env] for done in range(step - start_steps, step) if done >= -1):
+                starts.append((step, env))
+    expected *= 1 - share
+    for (step, env), weight in zip(starts, fade_weights(len(starts), fade_factor), strict=True):
+        expected[step - first, env] += share * weight
+
+    np.random.seed(stored + n_envs)
+    obs = buffer.sample(60_000).observations.numpy()
+    counts = np.zeros_like(expected)
+    np.add.at(counts, ((obs[:, 0] - first).astype(int), obs[:, 1].astype(int)), 1)
+    assert chi_square(counts, expected) > 1e-3
+
+    steps = buffer.sample(60_000, uniform=True).observations[:, 0].numpy().astype(int) - first
+    assert chi_square(np.bincount(steps), np.ones(stored - first)) > 1e-3
+
+
+def test_first_steps_that_are_all_overwritten():
+    buffer = FadingReplayBuffer(5, OBS, ACT, start_share=1.0, start_steps=3)
+    fill(buffer, 5)
+    assert set(buffer.sample(100).observations[:, 0].tolist()) == {1, 2}  # the oldest never
+    fill(buffer, 4)  # overwritten in the same episode
+    assert set(buffer.sample(200).observations[:, 0].tolist()) == {0, 1, 2, 3}
+
+
 def test_samples_are_copies():
     for buffer in (FadingReplayBuffer(10, OBS, ACT), FadingReplayBuffer(10, OBS, ACT, n_steps=2)):
         fill(buffer, 8)
@@ -213,7 +258,7 @@ def n_step_by_hand(dones, timeouts, first, last, step, env, n_steps, gamma):
     return total, discount, current + 0.5, 0.0 if bootstraps else 1.0
 
 
-@pytest.mark.parametrize("buffer_class", [FadingReplayBuffer, PrioritizedReplayBuffer])
+@pytest.mark.parametrize("buffer_class", [FadingReplayBuffer, STARTS, PrioritizedReplayBuffer])
 @pytest.mark.parametrize("n_envs", [1, 2])
 @pytest.mark.parametrize("stored", [13, 24, 41])
 def test_n_step_returns(buffer_class, n_envs, stored):

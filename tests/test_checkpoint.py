@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_symphony import REDQ, Symphony
+from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
 from sb3_symphony.common.checkpoint import ExactCheckpoints, newest_checkpoint
 from sb3_symphony.common.files import DamagedFile
 from sb3_symphony.common.recording import RecordedEpisode, record_episodes
@@ -74,9 +75,15 @@ def test_our_algorithms(tmp_path, make):
 
 
 def test_prioritised(tmp_path, make):
-    from sb3_symphony.common.buffers import PrioritizedReplayBuffer
-
     compared(tmp_path, lambda: make(replay_buffer_class=PrioritizedReplayBuffer, buffer_size=40))
+
+
+@pytest.mark.parametrize("buffer_size", [500, 40])
+def test_share_of_episodes_first_steps(tmp_path, make, buffer_size):
+    replay = dict(start_share=0.3, start_steps=5)
+    compared(
+        tmp_path, partial(make, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=replay, buffer_size=buffer_size)
+    )
 
 
 @pytest.mark.parametrize("n_envs", [1, 2])

@@ -69,7 +69,7 @@ def _acceptance_rate(fade_factor: float, fade_power: float) -> float:
     return float(np.mean(np.tanh(fade_factor * x**fade_power)) / np.tanh(fade_factor))
 
 
-def draw_faded_ages(size: int, n_draws: int, fade_factor: float, fade_power: float = 2.0) -> np.ndarray:
+def draw_faded_ages(size: int, n_draws: int, fade_factor: float | None, fade_power: float = 2.0) -> np.ndarray:
     """
     Draw age indices (0 = oldest) with exactly the probabilities of :func:`fade_weights`, with replacement.
 
@@ -78,10 +78,12 @@ def draw_faded_ages(size: int, n_draws: int, fade_factor: float, fade_power: flo
 
     :param size: number n of stored transitions, at least 1
     :param n_draws: number of indices to draw
-    :param fade_factor: steepness f > 0, finite
+    :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
     :param fade_power: power of the normalised age index, > 0
     :return: int array ``(n_draws,)`` of values in [0, size)
     """
+    if fade_factor is None or _is_uniform(fade_factor):
+        return np.random.randint(0, size, size=n_draws)
     newest = np.tanh(fade_factor * ((size - 1) / size) ** fade_power)
     if newest == 0:  # all weights vanish
         return np.random.randint(0, size, size=n_draws)
@@ -137,6 +139,22 @@ class _StepsReplayBuffer(NStepReplayBuffer):
             raise ValueError("mirror: expected observations as they are, not normalised ones (norm_obs=False)")
         return self.mirror(samples)
 
+    def _gather(self, rows: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None) -> ReplayBufferSamples:
+        """SB3 draws the environment of a row itself: show it one environment at a time, then restore the drawn order."""
+        if self.n_envs == 1:
+            return self._get_samples(rows, env=env)
+        order = np.argsort(env_indices, kind="stable")
+        parts = []
+        for index in np.unique(env_indices):
+            view = copy.copy(self)
+            view.n_envs = 1
+            for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+                setattr(view, name, getattr(self, name)[:, index : index + 1])  # shares memory
+            parts.append(view._get_samples(rows[env_indices == index], env=env))
+        back = th.as_tensor(np.argsort(order), device=self.device)
+        fields = (None if field[0] is None else th.cat(field)[back] for field in zip(*parts, strict=True))
+        return ReplayBufferSamples(*fields)  # type: ignore[arg-type]  # only discounts may be None
+
 
 class _FadedSampling(ReplayBuffer):
     """The rows drawn by both fading buffers; what a row holds is the business of the other base class."""
@@ -157,15 +175,16 @@ class _FadedSampling(ReplayBuffer):
         :return: SB3's samples, tensors of shape ``(batch_size, ...)``
         :raises ValueError: if the buffer is empty
         """
-        n_rows = self.size()
-        if n_rows == 0:
+        return self._get_samples(self._draw_rows(batch_size, uniform), env=env)
+
+    def _draw_rows(self, batch_size: int, uniform: bool) -> np.ndarray:
+        if self.size() == 0:
             raise ValueError(f"{type(self).__name__}: cannot sample, no transition is stored yet")
-        if uniform or self.fade_factor is None or _is_uniform(self.fade_factor):
-            return super().sample(batch_size, env=env)
-        rows = draw_faded_ages(n_rows, batch_size, self.fade_factor, self.fade_power)
-        if self.full:  # the oldest row is the next one to be overwritten
-            rows = (rows + self.pos) % self.buffer_size
-        return self._get_samples(rows, env=env)
+        if uniform or _is_uniform(self.fade_factor):
+            return draw_faded_ages(self.size(), batch_size, None)
+        ages = draw_faded_ages(self.size(), batch_size, self.fade_factor, self.fade_power)
+        # The oldest row is the next one to be overwritten
+        return (ages + self.pos) % self.buffer_size if self.full else ages
 
     def to_torch(self, array: np.ndarray, copy: bool = False) -> th.Tensor:
         # Samples are fancy-indexed, hence fresh arrays already: a second copy would protect nothing
@@ -199,6 +218,9 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
     :param fade_power: power of the normalised age index, > 0
     :param mirror: the robot's left-right symmetry, see :class:`~sb3_symphony.common.mirror.Mirror`; about every second
         transition is shown mirrored. Not with normalised observations. ``None``: transitions as they are
+    :param start_share: about this part of the draws comes from the first steps of episodes alone, in [0, 1]. Who walks well
+        starts once in a thousand steps, and forgets how
+    :param start_steps: how many steps of an episode count as its first ones, at least 1
     :raises ValueError: for a value outside the ranges above, Dict observations, or ``optimize_memory_usage=True``
     """
 
@@ -216,10 +238,14 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
         fade_factor: float | None = 7.0,
         fade_power: float = 2.0,
         mirror: Mapping[str, Any] | None = None,
+        start_share: float = 0.0,
+        start_steps: int = 100,
     ) -> None:
         _refuse_memory_optimisation("FadingReplayBuffer", optimize_memory_usage)
         if isinstance(observation_space, spaces.Dict):
             raise ValueError("FadingReplayBuffer does not hold Dict observations: use FadingDictReplayBuffer")
+        check_number("start_share", start_share, 0, 1)
+        check_number("start_steps", start_steps, 1, integer=True)
         super().__init__(
             buffer_size,
             observation_space,
@@ -233,6 +259,61 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
             fade_power=fade_power,
             mirror=mirror,
         )
+        self.start_share, self.start_steps = start_share, start_steps
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all transitions."""
+        super().reset()
+        # Ring of the places (row * n_envs + environment) of episodes' first steps, in the order of age
+        self.starts = np.zeros((self.buffer_size if self.start_share > 0 else 0, self.n_envs), dtype=np.int64)
+        self.oldest_start = self.n_starts = 0  # counted since the first one; those before the oldest are overwritten
+        self.episode_steps = np.zeros(self.n_envs, dtype=np.int64)  # of the episodes under way
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition per environment.
+
+        :param obs: observations ``(n_envs, ...)``
+        :param next_obs: next observations, the terminal ones where an episode ended
+        :param action: scaled actions ``(n_envs, action_dim)``
+        :param reward: rewards ``(n_envs,)``
+        :param done: ends of episodes ``(n_envs,)``
+        :param infos: one dictionary per environment
+        """
+        if self.start_share > 0:
+            self._note_starts(done)
+        super().add(obs, next_obs, action, reward, done, infos)
+
+    def _note_starts(self, done: np.ndarray) -> None:
+        starts, row_places = self.starts.reshape(-1), self.pos * self.n_envs + np.arange(self.n_envs)
+        # The row is overwritten now
+        while self.full and self.oldest_start < self.n_starts and starts[self.oldest_start % len(starts)] in row_places:
+            self.oldest_start += 1
+        for place in row_places[self.episode_steps < self.start_steps]:
+            starts[self.n_starts % len(starts)] = place
+            self.n_starts += 1
+        self.episode_steps = np.where(done, 0, self.episode_steps + 1)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None, uniform: bool = False) -> Any:
+        stored = self.n_starts - self.oldest_start
+        if uniform or stored == 0:
+            return super().sample(batch_size, env, uniform)
+        rows = self._draw_rows(batch_size, uniform)
+        env_indices = np.random.randint(0, self.n_envs, size=batch_size)
+        chosen = np.random.random(batch_size) < self.start_share
+        ages = draw_faded_ages(stored, int(chosen.sum()), self.fade_factor, self.fade_power)
+        places = self.starts.reshape(-1)[(self.oldest_start + ages) % self.starts.size]
+        rows[chosen], env_indices[chosen] = np.divmod(places, self.n_envs)
+        return self._gather(rows, env_indices, env)
 
 
 class FadingDictReplayBuffer(_FadedSampling, DictReplayBuffer):
@@ -506,22 +587,6 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
         weights = (weights / weights.max()).astype(np.float32).reshape(-1, 1)
         samples = self._gather(leaves // self.n_envs, leaves % self.n_envs, env)
         return PrioritizedReplayBufferSamples(*samples, weights=self.to_torch(weights), indices=leaves)
-
-    def _gather(self, rows: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None) -> ReplayBufferSamples:
-        """SB3 draws the environment of a row itself: show it one environment at a time, then restore the drawn order."""
-        if self.n_envs == 1:
-            return self._get_samples(rows, env=env)
-        order = np.argsort(env_indices, kind="stable")
-        parts = []
-        for index in np.unique(env_indices):
-            view = copy.copy(self)
-            view.n_envs = 1
-            for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
-                setattr(view, name, getattr(self, name)[:, index : index + 1])  # shares memory
-            parts.append(view._get_samples(rows[env_indices == index], env=env))
-        back = th.as_tensor(np.argsort(order), device=self.device)
-        fields = (None if field[0] is None else th.cat(field)[back] for field in zip(*parts, strict=True))
-        return ReplayBufferSamples(*fields)  # type: ignore[arg-type]  # only discounts may be None
 
     def update_priorities(self, indices: np.ndarray, td_errors: np.ndarray | th.Tensor) -> None:
         """

@@ -65,6 +65,9 @@ class DecayingActionNoise(ActionNoise):
     @property
     def sigma_t(self) -> float:
         """Standard deviation of the next draw, in scaled action units."""
+        return self._decayed(self.sigma, self.sigma_final)
+
+    def _decayed(self, start: float, end: float) -> float:
         progress = self.t / self.decay_steps
         if self.decay == "constant":
             remaining = 1.0
@@ -76,7 +79,7 @@ class DecayingActionNoise(ActionNoise):
             remaining = 1.0 - progress
         else:
             remaining = 0.5 * (1.0 + math.cos(math.pi * progress))
-        return self.sigma_final + (self.sigma - self.sigma_final) * remaining
+        return end + (start - end) * remaining
 
     def __call__(self) -> np.ndarray:
         """
@@ -159,15 +162,11 @@ class StickyActionNoise(DecayingActionNoise):
     :param hold: environment steps for which a draw is repeated, >= 1
     :param n_envs: environment steps that one call stands for (see :class:`DecayingActionNoise`)
     :param episode_scale: smallest and largest factor of an episode, 0 <= smallest <= largest
-    :param independent: standard deviation of independent Gaussian noise on top, >= 0; it does not decay, and is the same in
-        quiet and loud episodes. A deterministic actor's substitute for what a stochastic one tries by itself
+    :param independent: standard deviation of independent Gaussian noise on top, >= 0, the same in quiet and loud episodes.
+        A deterministic actor's substitute for what a stochastic one tries by itself
+    :param independent_final: what it decays to, together with σ_t; ``None``: it stays
     :raises ValueError: for a value outside the ranges above
     """
-
-    # Of noises saved before they had them
-    episode_scale: tuple[float, float] = (1.0, 1.0)
-    independent = 0.0
-    factor = 1.0  # of the present episode
 
     def __init__(
         self,
@@ -181,9 +180,12 @@ class StickyActionNoise(DecayingActionNoise):
         n_envs: int = 1,
         episode_scale: tuple[float, float] = (1.0, 1.0),
         independent: float = 0.0,
+        independent_final: float | None = None,
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
         check_number("independent", independent, 0)
+        if independent_final is not None:
+            check_number("independent_final", independent_final, 0)
         if not 0 <= correlation < 1:
             raise ValueError(f"correlation={correlation!r}: expected a number in [0, 1)")
         check_number("hold", hold, 1, integer=True)
@@ -197,11 +199,13 @@ class StickyActionNoise(DecayingActionNoise):
         self.hold = hold
         self.episode_scale = episode_scale
         self.independent = independent
+        self.independent_final = independent if independent_final is None else independent_final
         self.reset()
 
     def reset(self) -> None:
         """Start a new episode: forget the last draw (the decay goes on)."""
         self.x: np.ndarray | None = None
+        self.factor = 1.0  # of the episode, drawn with its first x
         self.held = 0  # steps for which x has been used
 
     def _draw(self, sigma: float) -> np.ndarray:
@@ -215,8 +219,9 @@ class StickyActionNoise(DecayingActionNoise):
             self.held = 0
         self.held += 1
         noise = sigma * self.factor * self.x
-        if self.independent > 0:
-            noise = noise + self.independent * np.random.standard_normal(self.n_actions)
+        independent = self._decayed(self.independent, self.independent_final)
+        if independent > 0:
+            noise = noise + independent * np.random.standard_normal(self.n_actions)
         return noise
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
+from sb3_symphony.common.buffers import FadingReplayBuffer
 from sb3_symphony.common.files import seal, unseal
 
 _STORAGE = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -204,4 +205,6 @@ def end_trajectory(buffer: ReplayBuffer, segments: ReplaySegments) -> None:
         # Others need no mark: they bootstrap from the next observation that they stored
         buffer.dones[last] = True
         buffer.timeouts[last] = buffer.handle_timeout_termination
+    if isinstance(buffer, FadingReplayBuffer):
+        buffer.episode_steps[:] = 0
     segments.saved = max(segments.saved - 1, 0)  # that row is to be written again
