@@ -22,6 +22,7 @@ CLASSES = {
     "SB3's uniform": (ReplayBuffer, {}),
     "fading": (FadingReplayBuffer, {}),
     "fading, 3-step returns": (FadingReplayBuffer, dict(n_steps=3, gamma=0.99)),
+    "fading, a quarter of first steps": (FadingReplayBuffer, dict(start_share=0.25)),
     "prioritised": (PrioritizedReplayBuffer, {}),
 }
 
@@ -31,6 +32,9 @@ def filled(cls: type[ReplayBuffer], size: int, kwargs: dict) -> ReplayBuffer:
     for array in (buffer.observations, buffer.next_observations, buffer.actions, buffer.rewards):
         array[...] = 1.0
     buffer.full = True
+    if isinstance(buffer, FadingReplayBuffer) and buffer.start_share > 0:  # episodes of 1 000 steps
+        places = np.flatnonzero(np.arange(size) % 1000 < buffer.start_steps)
+        buffer.starts[: len(places), 0], buffer.n_starts = places, len(places)
     if isinstance(buffer, PrioritizedReplayBuffer):
         for chunk in np.array_split(np.arange(size), max(1, size // 100_000)):
             buffer.update_priorities(chunk, np.random.rand(len(chunk)) + 0.1)
@@ -59,7 +63,7 @@ def main() -> None:
                     buffer.update_priorities(batch.indices, np.random.rand(arguments.batch))
             quartiles = [round(float(value), 1) for value in np.percentile(samples, [25, 50, 75])]
             rows.append(dict(buffer=name, size=size, batch=arguments.batch, microseconds_quartiles=quartiles))
-            print(f"{name:24s} {size:10,d} transitions: {quartiles[1]:7.1f} microseconds for {arguments.batch}", flush=True)
+            print(f"{name:32s} {size:10,d} transitions: {quartiles[1]:7.1f} microseconds for {arguments.batch}", flush=True)
             del buffer
     if arguments.output is not None:
         write(arguments.output, rows)
