@@ -55,6 +55,8 @@ def test_numbers(make, name, value):
         ("min_mix", math.nan),
         ("min_mix", True),
         ("min_mix", "1"),
+        ("min_mix", (1,)),
+        ("min_mix", (1, 0, 0)),
         ("target_policy_noise", -0.1),
         ("saturation_penalty", -0.1),
         ("saturation_penalty", math.nan),
@@ -158,9 +160,10 @@ def test_choices(make, name, value, nearest):
         assert f"did you mean '{nearest}'?" in message
 
 
-def test_what_the_actor_follows(small):
-    message = refused(lambda **kwargs: small(Symphony, **kwargs), "actor_mode", "maen", ValueError)
-    assert "did you mean 'mean'?" in message
+@pytest.mark.parametrize("value", [(1.5, 0), [1, 1.5]])
+def test_each_of_two_mixes(small, value):
+    with pytest.raises(ValueError, match=r"min_mix=1\.5: expected a number >= 0 and <= 1"):
+        small(Symphony, min_mix=value)
 
 
 @pytest.mark.parametrize("cls", [REDQ, DroQ])

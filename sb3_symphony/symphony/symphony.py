@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number
-from sb3_symphony.common.ensembles import TARGET_MODES, combine
+from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
 from sb3_symphony.common.noise import DecayingNormalActionNoise
 from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, noise_std
@@ -56,10 +56,9 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param n_critics: Number of independent critics, each with its own target. Read's paper: one is the original
         algorithm, two the enhanced one; the author's code has three
     :param policy_delay: Critic updates per actor update
-    :param target_mode: How the critics are combined in the target: ``"min"``, ``"mean"`` or ``"rem"``
-    :param actor_mode: How they are combined for the actor, likewise; ``None``: as in the target, which is Symphony's. REDQ's
-        actor follows the mean
-    :param min_mix: In mode ``"min"``: weight of the minimum, the rest is on the mean
+    :param target_mode: How the critics are combined, in the target and for the actor: ``"min"``, ``"mean"`` or ``"rem"``
+    :param min_mix: In mode ``"min"``: weight of the minimum, the rest is on the mean. Two numbers: that in the target and that
+        for the actor, whose ``(1, 0)`` is REDQ's way
     :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it, clipped at
         2.5 standard deviations (as in TD3; not a part of Symphony, whose sources have none)
     :param saturation_penalty: Weight of Σ max(0, abs(u) - 1.5)² in the actor's loss, u being the action's components before
@@ -113,8 +112,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         n_critics: int = 2,
         policy_delay: int = 1,
         target_mode: str = "min",
-        actor_mode: str | None = None,
-        min_mix: float = 1.0,
+        min_mix: float | tuple[float, float] = 1.0,
         target_policy_noise: float = 0.0,
         saturation_penalty: float = 0.0,
         critic_loss: str = "rehe",
@@ -159,7 +157,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             sde_support=False,
         )
         self.critic_learning_rate = critic_learning_rate
-        self.actor_mode = actor_mode
         self.min_mix = min_mix
         self.target_policy_noise = target_policy_noise
         self.saturation_penalty = saturation_penalty
@@ -170,9 +167,12 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
         if critic_learning_rate is not None and not callable(critic_learning_rate):
             check_number("critic_learning_rate", critic_learning_rate, 0)
-        if actor_mode is not None:
-            check_choice("actor_mode", actor_mode, TARGET_MODES)
-        check_number("min_mix", min_mix, 0, 1)
+        mixes = min_mix if isinstance(min_mix, (tuple, list)) else (min_mix, min_mix)
+        if len(mixes) != 2:
+            raise ValueError(f"min_mix={min_mix!r}: expected a number, or two (target, actor)")
+        for weight in mixes:
+            check_number("min_mix", weight, 0, 1)
+        self.target_mix, self.actor_mix = mixes
         check_number("target_policy_noise", target_policy_noise, 0)
         check_number("saturation_penalty", saturation_penalty, 0)
         check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
@@ -234,7 +234,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
                 with th.no_grad():
                     # The online actor; minimum over the critics: (n_critics, batch, 1) -> (batch, 1)
                     next_q_values = self._regression.target_q_values(batch.next_observations, next_action)
-                    next_values = combine(next_q_values, self.target_mode, self.min_mix)
+                    next_values = combine(next_q_values, self.target_mode, self.target_mix)
                     target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
 
                 # The author moves the target critics before he computes the target; moving them right after the
@@ -256,7 +256,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         """One step of the actor toward the combined critics."""
         before_tanh = self.actor.before_tanh(batch.observations)  # (batch, n_actions)
         q_values = self._regression.q_values(batch.observations, th.tanh(before_tanh))
-        q_values = combine(q_values, self.actor_mode or self.target_mode, self.min_mix)
+        q_values = combine(q_values, self.target_mode, self.actor_mix)
         actor_loss = -ACTOR_LOSSES[self.actor_loss](q_values, self.baseline)
         if self.saturation_penalty > 0:
             excess = F.relu(before_tanh.abs() - SATURATED)  # (batch, n_actions)

@@ -105,7 +105,7 @@ class SymphonyV2(Symphony):
         :return: the pairs of :meth:`actor_terms`
         """
         actions = self.actor(observations)
-        q_values = combine(self.critic(observations, actions), self.actor_mode or self.target_mode, self.min_mix)
+        q_values = combine(self.critic(observations, actions), self.target_mode, self.actor_mix)
         return [(q_values, baseline), (self.policy.variance(observations, actions)[0], variance_baseline)]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
