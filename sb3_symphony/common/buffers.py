@@ -129,6 +129,39 @@ class _StepsReplayBuffer(NStepReplayBuffer):
         super().__init__(*args, n_steps=n_steps, gamma=gamma, **kwargs)
         self.mirror = None if mirror is None else Mirror(mirror, self.observation_space, self.action_space)
 
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition per environment.
+
+        :param obs: observations ``(n_envs, ...)``
+        :param next_obs: next observations, the terminal ones where an episode ended
+        :param action: scaled actions ``(n_envs, action_dim)``
+        :param reward: rewards ``(n_envs,)``
+        :param done: ends of episodes ``(n_envs,)``
+        :param infos: one dictionary per environment
+        """
+        self._before_row(done)
+        super().add(obs, next_obs, action, reward, done, infos)
+
+    def _before_row(self, done: np.ndarray) -> None:
+        """
+        What a subclass notes of the row that is written next.
+
+        :param done: ends of episodes ``(n_envs,)``
+        """
+
+    def _row_places(self) -> np.ndarray:
+        """Places (row * n_envs + environment) of the row that is written next, ``(n_envs,)``."""
+        return self.pos * self.n_envs + np.arange(self.n_envs)
+
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         one_step = self.n_steps == 1
         get_samples = partial(ReplayBuffer._get_samples, self) if one_step else super()._get_samples
@@ -270,31 +303,10 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
         self.oldest_start = self.n_starts = 0  # counted since the first one; those before the oldest are overwritten
         self.episode_steps = np.zeros(self.n_envs, dtype=np.int64)  # of the episodes under way
 
-    def add(
-        self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """
-        Store one transition per environment.
-
-        :param obs: observations ``(n_envs, ...)``
-        :param next_obs: next observations, the terminal ones where an episode ended
-        :param action: scaled actions ``(n_envs, action_dim)``
-        :param reward: rewards ``(n_envs,)``
-        :param done: ends of episodes ``(n_envs,)``
-        :param infos: one dictionary per environment
-        """
-        if self.start_share > 0:
-            self._note_starts(done)
-        super().add(obs, next_obs, action, reward, done, infos)
-
-    def _note_starts(self, done: np.ndarray) -> None:
-        starts, row_places = self.starts.reshape(-1), self.pos * self.n_envs + np.arange(self.n_envs)
+    def _before_row(self, done: np.ndarray) -> None:
+        if self.start_share == 0:
+            return
+        starts, row_places = self.starts.reshape(-1), self._row_places()
         # The row is overwritten now
         while self.full and self.oldest_start < self.n_starts and starts[self.oldest_start % len(starts)] in row_places:
             self.oldest_start += 1
@@ -537,28 +549,8 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
         self.max_priority = 1.0  # before the exponent alpha
         self._samples_without_update = 0
 
-    def add(
-        self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """
-        Store one transition per environment, with the largest priority seen so far.
-
-        :param obs: observations ``(n_envs, ...)``
-        :param next_obs: next observations, the terminal ones where an episode ended
-        :param action: scaled actions ``(n_envs, action_dim)``
-        :param reward: rewards ``(n_envs,)``
-        :param done: ends of episodes ``(n_envs,)``
-        :param infos: one dictionary per environment
-        """
-        leaves = self.pos * self.n_envs + np.arange(self.n_envs)
-        super().add(obs, next_obs, action, reward, done, infos)
-        self.tree.set(leaves, self.max_priority**self.alpha)
+    def _before_row(self, done: np.ndarray) -> None:
+        self.tree.set(self._row_places(), self.max_priority**self.alpha)
 
     def sample(  # type: ignore[override]  # a tuple with two more fields than SB3's
         self, batch_size: int, env: VecNormalize | None = None
