@@ -57,6 +57,7 @@ def test_numbers(make, name, value):
         ("min_mix", "1"),
         ("min_mix", (1,)),
         ("min_mix", (1, 0, 0)),
+        ("min_mix", (0, 1, 0, 100)),
         ("target_policy_noise", -0.1),
         ("saturation_penalty", -0.1),
         ("saturation_penalty", math.nan),
@@ -164,6 +165,20 @@ def test_choices(make, name, value, nearest):
 def test_each_of_two_mixes(small, value):
     with pytest.raises(ValueError, match=r"min_mix=1\.5: expected a number >= 0 and <= 1"):
         small(Symphony, min_mix=value)
+
+
+@pytest.mark.parametrize(
+    "value, message",
+    [
+        ((0, 1, 100), r"min_mix=\(0, 1, 100\): expected a number, or four"),
+        ((0, 1.5, 0, 100), r"min_mix=1\.5: expected a number >= 0 and <= 1"),
+        ((0, 1, -1, 100), "first step=-1: expected an integer >= 0"),
+        ((0, 1, 100, 100), "last step=100: expected an integer >= 101"),
+    ],
+)
+def test_moving_mix(small, value, message):
+    with pytest.raises(ValueError, match=message):
+        small(Symphony, min_mix=(value, 0))
 
 
 @pytest.mark.parametrize("cls", [REDQ, DroQ])

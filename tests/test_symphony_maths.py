@@ -153,6 +153,20 @@ def test_two_calls_equal_the_slow_algorithm(monkeypatch, engine, variant):
     assert ends <= {(round(obs, 9), terminated) for obs, terminated in stored}
 
 
+@pytest.mark.parametrize("step, mixes", [(9, (0.2, 1)), (150, (0.4, 0.75)), (200, (0.6, 0.5)), (900, (0.6, 0))])
+def test_moving_mixes(step, mixes):
+    """At each step the same as with fixed weights of that size."""
+    moving, fixed = ((0.2, 0.6, 100, 200), (1, 0, 100, 300)), mixes
+    states = []
+    for min_mix in (moving, fixed):
+        model, _ = model_with_data(min_mix=min_mix, initial_gradient_steps=(0, 0))
+        model.num_timesteps = step
+        model.train(2)
+        states.append(model.policy.state_dict())
+    for name, value in states[0].items():
+        th.testing.assert_close(value, states[1][name], rtol=1e-6, atol=1e-7, msg=name)
+
+
 def test_initial_updates_sample_uniformly_first_and_happen_once(monkeypatch):
     model, _ = model_with_data(batch_size=10, initial_gradient_steps=(4, 6))
     draws = record_draws(model, monkeypatch)

@@ -73,7 +73,7 @@ _AT_LEAST_ONE = {
     "target_update_interval",
     "train_freq",
 }
-_FRACTION = {"actor_averaging", "dropout_rate", "gae_lambda", "gamma", "min_mix", "tau"}
+_FRACTION = {"actor_averaging", "dropout_rate", "gae_lambda", "gamma", "tau"}
 _ANY_SIGN = {"gradient_steps", "sde_sample_freq", "target_entropy"}
 
 

@@ -21,6 +21,7 @@ from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInp
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
 
 SATURATED = 1.5  # before the tanh, whose slope there is 0.18
+Weight = float | tuple[float, float, int, int]  # a number, or one that moves: (initial, final, first step, last step)
 
 
 class Symphony(EnsembleOffPolicyAlgorithm):
@@ -57,8 +58,9 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         algorithm, two the enhanced one; the author's code has three
     :param policy_delay: Critic updates per actor update
     :param target_mode: How the critics are combined, in the target and for the actor: ``"min"``, ``"mean"`` or ``"rem"``
-    :param min_mix: In mode ``"min"``: weight of the minimum, the rest is on the mean. Two numbers: that in the target and that
-        for the actor, whose ``(1, 0)`` is REDQ's way
+    :param min_mix: In mode ``"min"``: weight of the minimum, the rest is on the mean. Two weights: that in the target and that
+        for the actor, whose ``(1, 0)`` is REDQ's way. Each may move, from ``a`` at step ``s`` to ``b`` at step ``t``, if it is
+        given as ``(a, b, s, t)``: ``((0.5, 1, 15_000, 30_000), 0)`` hopes first and is careful later
     :param target_policy_noise: Standard deviation of Gaussian noise added to the target's actions, to smooth it, clipped at
         2.5 standard deviations (as in TD3; not a part of Symphony, whose sources have none)
     :param saturation_penalty: Weight of Σ max(0, abs(u) - 1.5)² in the actor's loss, u being the action's components before
@@ -112,7 +114,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         n_critics: int = 2,
         policy_delay: int = 1,
         target_mode: str = "min",
-        min_mix: float | tuple[float, float] = 1.0,
+        min_mix: float | tuple[Weight, Weight] = 1.0,
         target_policy_noise: float = 0.0,
         saturation_penalty: float = 0.0,
         critic_loss: str = "rehe",
@@ -167,12 +169,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
         if critic_learning_rate is not None and not callable(critic_learning_rate):
             check_number("critic_learning_rate", critic_learning_rate, 0)
-        mixes = min_mix if isinstance(min_mix, (tuple, list)) else (min_mix, min_mix)
-        if len(mixes) != 2:
-            raise ValueError(f"min_mix={min_mix!r}: expected a number, or two (target, actor)")
-        for weight in mixes:
-            check_number("min_mix", weight, 0, 1)
-        self.target_mix, self.actor_mix = mixes
+        self._set_mixes()
         check_number("target_policy_noise", target_policy_noise, 0)
         check_number("saturation_penalty", saturation_penalty, 0)
         check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
@@ -203,6 +200,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         # Switch to train mode (this affects dropout)
         self.policy.set_training_mode(True)
+        self._set_mixes()
         self._update_learning_rate(self.actor.optimizer)
         update_learning_rate(self.critic.optimizer, self.critic_lr_schedule(self._current_progress_remaining))
 
@@ -220,6 +218,13 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
         self._new_episodes = 0
         self._log_update(n_updates_before, logs, noise_std(self.action_noise))
+
+    def _set_mixes(self) -> None:
+        """Weights of the minimum, in the target and for the actor, at the present step."""
+        pair = self.min_mix if isinstance(self.min_mix, (tuple, list)) else (self.min_mix, self.min_mix)
+        if len(pair) != 2:
+            raise ValueError(f"min_mix={self.min_mix!r}: expected a number, or two (target, actor)")
+        self.target_mix, self.actor_mix = (_weight(each, self.num_timesteps) for each in pair)
 
     def _update(self, gradient_steps: int, batch_size: int, logs: dict[str, list[th.Tensor]], **sample_kwargs: Any) -> None:
         # The actor is frozen inside a segment: one forward pass gives all its next actions
@@ -309,3 +314,16 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         return state_dicts, [*tensors, "baseline"]
+
+
+def _weight(weight: Weight, step: int) -> float:
+    """Value of a weight of the minimum at a step."""
+    moving = weight if isinstance(weight, (tuple, list)) else (weight, weight, 0, 1)
+    if len(moving) != 4:
+        raise ValueError(f"min_mix={weight!r}: expected a number, or four (initial, final, first step, last step)")
+    initial, final, start, end = moving
+    for value in (initial, final):
+        check_number("min_mix", value, 0, 1)
+    check_number("min_mix: first step", start, 0, integer=True)
+    check_number("min_mix: last step", end, start + 1, integer=True)
+    return float(np.interp(step, (start, end), (initial, final)))
