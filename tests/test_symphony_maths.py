@@ -445,6 +445,7 @@ def test_saturation_penalty(scale, shift, saturated):
         gradients.append([parameter.grad.double() for parameter in model.actor.parameters()])
     u = actor.before_tanh(batch.observations).double()
     assert saturated[0] <= (u.abs() > 1.5).double().mean() <= saturated[1]
+    assert scale < 30 or u.abs().min() > 10
     expected = ((u - u.clamp(-1.5, 1.5)) ** 2).sum(dim=1).mean()
     for without, with_it, part in zip(*gradients, th.autograd.grad(0.3 * expected, actor.parameters()), strict=True):
         th.testing.assert_close(with_it - without, part.double(), rtol=1e-3, atol=1e-5)

@@ -169,6 +169,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
         if critic_learning_rate is not None and not callable(critic_learning_rate):
             check_number("critic_learning_rate", critic_learning_rate, 0)
+        _check_mixes(min_mix)
         self._set_mixes()
         check_number("target_policy_noise", target_policy_noise, 0)
         check_number("saturation_penalty", saturation_penalty, 0)
@@ -221,10 +222,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
     def _set_mixes(self) -> None:
         """Weights of the minimum, in the target and for the actor, at the present step."""
-        pair = self.min_mix if isinstance(self.min_mix, (tuple, list)) else (self.min_mix, self.min_mix)
-        if len(pair) != 2:
-            raise ValueError(f"min_mix={self.min_mix!r}: expected a number, or two (target, actor)")
-        self.target_mix, self.actor_mix = (_weight(each, self.num_timesteps) for each in pair)
+        self.target_mix, self.actor_mix = (_weight(each, self.num_timesteps) for each in _pair(self.min_mix))
 
     def _update(self, gradient_steps: int, batch_size: int, logs: dict[str, list[th.Tensor]], **sample_kwargs: Any) -> None:
         # The actor is frozen inside a segment: one forward pass gives all its next actions
@@ -316,14 +314,29 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         return state_dicts, [*tensors, "baseline"]
 
 
+def _pair(value: Any) -> Any:
+    return value if isinstance(value, (tuple, list)) else (value, value)
+
+
 def _weight(weight: Weight, step: int) -> float:
     """Value of a weight of the minimum at a step."""
-    moving = weight if isinstance(weight, (tuple, list)) else (weight, weight, 0, 1)
-    if len(moving) != 4:
-        raise ValueError(f"min_mix={weight!r}: expected a number, or four (initial, final, first step, last step)")
-    initial, final, start, end = moving
-    for value in (initial, final):
-        check_number("min_mix", value, 0, 1)
-    check_number("min_mix: first step", start, 0, integer=True)
-    check_number("min_mix: last step", end, start + 1, integer=True)
+    if not isinstance(weight, (tuple, list)):
+        return weight
+    initial, final, start, end = weight
     return float(np.interp(step, (start, end), (initial, final)))
+
+
+def _check_mixes(min_mix: Any) -> None:
+    """Refuse what :func:`_weight` cannot take; here, so that not every call of ``train`` does it."""
+    pair = _pair(min_mix)
+    if len(pair) != 2:
+        raise ValueError(f"min_mix={min_mix!r}: expected a number, or two (target, actor)")
+    for weight in pair:
+        moving = weight if isinstance(weight, (tuple, list)) else (weight, weight, 0, 1)
+        if len(moving) != 4:
+            raise ValueError(f"min_mix={weight!r}: expected a number, or four (initial, final, first step, last step)")
+        initial, final, start, end = moving
+        check_number("min_mix", initial, 0, 1)
+        check_number("min_mix", final, 0, 1)
+        check_number("min_mix: first step", start, 0, integer=True)
+        check_number("min_mix: last step", end, start + 1, integer=True)
