@@ -1,5 +1,6 @@
 """Algorithms that live beside a study: numbers worked out by hand, and a life through saving and loading."""
 
+from collections import defaultdict
 from pathlib import Path
 
 import gymnasium as gym
@@ -213,11 +214,12 @@ def test_targets_of_random_pairs():
 
 
 def test_the_actor_follows_the_mean_of_all():
-    model = make(ALGORITHMS[6], n_critics=3)
+    settings = yaml.safe_load((STUDIES / "redq" / "redq_td3.yml").read_text())
+    model = make(ALGORITHMS[6], n_critics=3, min_mix=settings["min_mix"], actor_loss=settings["actor_loss"])
     batch = batch_of(model)
     with th.no_grad():
         expected = -model.critic(batch.observations, model.actor(batch.observations)).mean()
-    logs = {"actor_loss": []}
+    logs = defaultdict(list)
     model._update_actor(batch, logs)
     th.testing.assert_close(logs["actor_loss"][0], expected)
 

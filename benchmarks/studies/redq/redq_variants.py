@@ -10,7 +10,6 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
 from sb3_symphony.common.ensembles import EnsembleCritic, StackedMLP, hidden_layers
@@ -173,7 +172,8 @@ class BatchNormREDQ(REDQ):
 class REDQTD3(Symphony):
     """
     REDQ's critics under TD3: a deterministic actor that follows the mean of all critics, smoothed targets that take the
-    minimum over a random pair of them. Unlike TD3, the actor has no target network. Settings: redq_td3.yml.
+    minimum over a random pair of them. Unlike TD3, the actor has no target network. The random pair is the only thing that
+    is not a setting, see redq_td3.yml.
     """
 
     subset_size = 2
@@ -187,10 +187,3 @@ class REDQTD3(Symphony):
             return of_members(observations, actions, members)
 
         self._regression.target_q_values = target_q_values  # type: ignore[method-assign,assignment]  # of this regression alone
-
-    def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
-        actor_loss = -self._regression.q_values(batch.observations, self.actor(batch.observations)).mean()
-        self.actor.optimizer.zero_grad()
-        actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
-        self.actor.optimizer.step()
-        logs["actor_loss"].append(actor_loss.detach())
