@@ -192,7 +192,7 @@ def q_bias(
             done = False
             while not done:
                 steps.append(_act(model, observation, ent_coef))
-                observation, reward, dones, infos = vec_env.step(steps[-1].action)  # type: ignore[assignment]  # SB3's type of step()'s
+                observation, reward, dones, infos = vec_env.step(steps[-1].action)
                 rewards.append(float(reward[0]))
                 done = bool(dones[0])
             last_value = 0.0

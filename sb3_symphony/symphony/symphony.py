@@ -315,14 +315,18 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
 
 def _pair(value: Any) -> Any:
+    """``min_mix`` as two weights: in the target and for the actor."""
     return value if isinstance(value, (tuple, list)) else (value, value)
+
+
+def _moving(weight: Any) -> Any:
+    """A weight as ``(initial, final, first step, last step)``."""
+    return weight if isinstance(weight, (tuple, list)) else (weight, weight, 0, 1)
 
 
 def _weight(weight: Weight, step: int) -> float:
     """Value of a weight of the minimum at a step."""
-    if not isinstance(weight, (tuple, list)):
-        return weight
-    initial, final, start, end = weight
+    initial, final, start, end = _moving(weight)
     return float(np.interp(step, (start, end), (initial, final)))
 
 
@@ -332,7 +336,7 @@ def _check_mixes(min_mix: Any) -> None:
     if len(pair) != 2:
         raise ValueError(f"min_mix={min_mix!r}: expected a number, or two (target, actor)")
     for weight in pair:
-        moving = weight if isinstance(weight, (tuple, list)) else (weight, weight, 0, 1)
+        moving = _moving(weight)
         if len(moving) != 4:
             raise ValueError(f"min_mix={weight!r}: expected a number, or four (initial, final, first step, last step)")
         initial, final, start, end = moving
