@@ -347,8 +347,8 @@ class FadingDictReplayBuffer(_FadedSampling, DictReplayBuffer):
     """
 
     # SB3 declares one array on the parent and a dictionary on the Dict buffer
-    observations: dict[str, np.ndarray]  # type: ignore[assignment]
-    next_observations: dict[str, np.ndarray]  # type: ignore[assignment]
+    observations: dict[str, np.ndarray]
+    next_observations: dict[str, np.ndarray]
 
     def __init__(
         self,

@@ -149,7 +149,7 @@ def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
         distribution.exploration_mat = matrix.to(model.device)
         distribution.exploration_matrices = matrices.to(model.device)
     if state["noise"] is not None:
-        vars(model.action_noise).update(state["noise"])  # type: ignore[attr-defined]  # in place: learn() holds it already
+        vars(model.action_noise).update(state["noise"])  # in place: learn() holds it already
     for name, values in state["log"].items():
         vars(model.logger)[name].update(values)
     restore_vec_env(model.env, state["vec env"])

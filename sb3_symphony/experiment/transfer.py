@@ -87,7 +87,7 @@ def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, selection: Sele
                 if name not in given:  # such as that of an entropy coefficient that was fixed
                     continue
                 settings = [{k: v for k, v in group.items() if k != "params"} for group in target.param_groups]
-                target.load_state_dict(given[name])  # type: ignore[arg-type]
+                target.load_state_dict(given[name])
                 for group, own in zip(target.param_groups, settings, strict=True):
                     group.update(own)
             else:
