@@ -19,6 +19,7 @@ from sb3_symphony.common.wrappers import (
     RewardScale,
     StallPenalty,
     TorsoMass,
+    UnseenGoal,
     needs_fresh_world,
 )
 
@@ -153,6 +154,26 @@ def test_stall_penalty():
     assert rewards == pytest.approx([0.07 * math.log(1e-6)])
 
 
+@pytest.mark.parametrize(
+    "last, penalty, expected", [(0.5, -100, (False, True)), (-100.0, -100, (True, False)), (-20.0, -20, (True, False))]
+)
+@pytest.mark.parametrize("around", [lambda env: env, RewardFloor])
+@pytest.mark.parametrize("inside", [lambda env: env, RewardFloor])
+def test_unseen_goal(last, penalty, expected, around, inside):
+    env = around(UnseenGoal(inside(Scripted([1.0, -2.0, last])), penalty=penalty))
+    rewards, terminated, truncated, infos = play(env)
+    assert (terminated, truncated) == expected and len(rewards) == 3
+    assert infos[-1]["episode"]["r"] == pytest.approx(-1 + last)
+
+
+def test_sb3_bootstraps_through_the_goal_and_not_through_a_fall():
+    for last, timeout in ((0.5, 1), (-100.0, 0)):
+        model = TD3("MlpPolicy", UnseenGoal(Scripted([1.0, last])), learning_starts=100, buffer_size=50, seed=0, device="cpu")
+        buffer = model.learn(4).replay_buffer
+        assert buffer.dones[:4, 0].tolist() == [0, 1, 0, 1]
+        assert buffer.timeouts[:4, 0].tolist() == [0, timeout, 0, timeout]
+
+
 def test_learning_reward_keeps_one_monitor():
     monitored = Monitor(Scripted([1.0]))
     assert RewardFloor(monitored).env is monitored
@@ -165,6 +186,7 @@ def test_wrong_reward_values():
     for make, message in (
         (lambda: RewardFloor(env, floor=float("nan")), "floor=nan"),
         (lambda: RewardBonus(env, bonus=float("inf")), "bonus=inf"),
+        (lambda: UnseenGoal(env, penalty=float("nan")), "penalty=nan"),
         (lambda: RewardScale(env, scale=0.0), r"scale=0\.0"),
         (lambda: StallPenalty(env, coef=-1.0), r"coef=-1\.0"),
         (lambda: StallPenalty(env, kind="C"), "kind='C'"),

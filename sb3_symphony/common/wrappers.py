@@ -1,9 +1,9 @@
 """
 Gymnasium wrappers, usable by dotted name as ``env_wrapper`` in a YAML configuration.
 
-Three kinds: what makes Box2D episodes repeatable (:class:`FreshBox2DWorld`), what changes the reward a learner sees while
-the reported return stays that of the environment (:class:`LearningReward` and its subclasses), and what changes the task
-(:class:`EpisodeStepLimit`, :class:`TorsoMass`, :class:`LegMass`).
+Three kinds: what makes Box2D episodes repeatable (:class:`FreshBox2DWorld`); what changes the rewards and ends that a learner
+sees, while the reported return stays that of the environment (:class:`LearningReward` and its subclasses); and what changes
+the task (:class:`EpisodeStepLimit`, :class:`TorsoMass`, :class:`LegMass`).
 """
 
 import math
@@ -219,6 +219,37 @@ class StallPenalty(LearningReward):
         if self.kind == "A":
             return reward + self.coef * (delta - math.log(max(1.0 / (delta + 1e-6), 1e-3)))
         return reward - self.coef * math.log10(1.0 / min(max(delta, 0.1), 10.0))
+
+
+class UnseenGoal(LearningReward):
+    """
+    An end without a penalty is a truncation to the learner, so that SB3 bootstraps through it; the reward stays.
+
+    Whoever cannot observe how far the goal is sees a walk that ends at random: states of the best gait then seem to be worth
+    anything between their value and 0, the more often the faster it is. BipedalWalker's goal lies on ground that looks like
+    all other ground, in 10 lidar rays of 5 m. Falls, whose penalty tells them, stay terminations.
+
+    :param env: environment
+    :param penalty: ends with this reward or less are terminations, in the environment's units
+    :raises ValueError: if it is not finite
+    """
+
+    def __init__(self, env: gym.Env, penalty: float = -100.0) -> None:
+        check_number("penalty", penalty)
+        self.penalty = float(penalty)
+        super().__init__(env)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        :param action: action of the environment
+        :return: observation, reward, terminated (only with a penalty), truncated (also at the goal), info
+        """
+        observation, reward, terminated, truncated, info = super().step(action)
+        goal = terminated and info["raw_reward"] > self.penalty
+        return observation, reward, terminated and not goal, truncated or goal, info
+
+    def learning_reward(self, observation: Any, reward: float) -> float:
+        return reward
 
 
 # ----------------------------------------------------------------------------------------------------------------------
