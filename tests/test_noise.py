@@ -175,15 +175,15 @@ def test_independent_noise_on_top():
     assert (both[1::2] - both[::2]).std() == pytest.approx(0.3 * np.sqrt(2), rel=0.05)
 
 
-def test_independent_noise_decays_with_the_other():
+def test_independent_noise_moves():
     np.random.seed(0)
-    quiet = dict(episode_scale=(0.0, 0.0), independent=0.4, independent_final=0.1)
-    noise = StickyActionNoise(50, sigma=0.5, sigma_final=0.0, decay_steps=1000, decay="linear", **quiet)
-    draws = series(noise, 2000)
-    for t in (0, 500, 900):
-        sigma = 0.4 - 0.3 * (t + 50) / 1000
+    noise = StickyActionNoise(50, sigma=0.5, episode_scale=(0.0, 0.0), independent=(0.4, 0.1, 1000, 2000))
+    draws = series(noise, 3000)
+    assert draws[:1000].std() == pytest.approx(0.4, rel=0.02)
+    for t in (1000, 1500, 1900):
+        sigma = 0.4 - 0.3 * (t + 50 - 1000) / 1000
         assert draws[t : t + 100].std() == pytest.approx(sigma, rel=0.05)
-    assert draws[1000:].std() == pytest.approx(0.1, rel=0.02)
+    assert draws[2000:].std() == pytest.approx(0.1, rel=0.02)
 
 
 def test_sticky_scale_of_each_episode():
@@ -314,7 +314,7 @@ def test_wrong_values(noise_class, wrong):
         (StickyActionNoise, "correlation", -0.5),
         (StickyActionNoise, "hold", 0),
         (StickyActionNoise, "independent", -0.1),
-        (StickyActionNoise, "independent_final", -0.1),
+        (StickyActionNoise, "independent", (0.2, 0.1, 100)),
         (StickyActionNoise, "episode_scale", 1.5),
         (StickyActionNoise, "episode_scale", (1.5, 0.5)),
         (PinkActionNoise, "beta", -1.0),

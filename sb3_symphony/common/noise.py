@@ -14,6 +14,7 @@ import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 
 from sb3_symphony.common.checks import check_choice, check_number
+from sb3_symphony.common.moving import Moving, at_step, check_moving
 
 DECAYS = ("cosine", "linear", "tanh", "constant")
 
@@ -65,9 +66,6 @@ class DecayingActionNoise(ActionNoise):
     @property
     def sigma_t(self) -> float:
         """Standard deviation of the next draw, in scaled action units."""
-        return self._decayed(self.sigma, self.sigma_final)
-
-    def _decayed(self, start: float, end: float) -> float:
         progress = self.t / self.decay_steps
         if self.decay == "constant":
             remaining = 1.0
@@ -79,7 +77,7 @@ class DecayingActionNoise(ActionNoise):
             remaining = 1.0 - progress
         else:
             remaining = 0.5 * (1.0 + math.cos(math.pi * progress))
-        return end + (start - end) * remaining
+        return self.sigma_final + (self.sigma - self.sigma_final) * remaining
 
     def __call__(self) -> np.ndarray:
         """
@@ -163,8 +161,8 @@ class StickyActionNoise(DecayingActionNoise):
     :param n_envs: environment steps that one call stands for (see :class:`DecayingActionNoise`)
     :param episode_scale: smallest and largest factor of an episode, 0 <= smallest <= largest
     :param independent: standard deviation of independent Gaussian noise on top, >= 0, the same in quiet and loud episodes.
-        A deterministic actor's substitute for what a stochastic one tries by itself
-    :param independent_final: what it decays to, together with σ_t; ``None``: it stays
+        A deterministic actor's substitute for what a stochastic one tries by itself. It may move, from ``a`` at step ``s`` to
+        ``b`` at step ``t``, if it is given as ``(a, b, s, t)``
     :raises ValueError: for a value outside the ranges above
     """
 
@@ -179,13 +177,10 @@ class StickyActionNoise(DecayingActionNoise):
         hold: int = 1,
         n_envs: int = 1,
         episode_scale: tuple[float, float] = (1.0, 1.0),
-        independent: float = 0.0,
-        independent_final: float | None = None,
+        independent: Moving = 0.0,
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
-        check_number("independent", independent, 0)
-        if independent_final is not None:
-            check_number("independent_final", independent_final, 0)
+        check_moving("independent", independent, 0)
         if not 0 <= correlation < 1:
             raise ValueError(f"correlation={correlation!r}: expected a number in [0, 1)")
         check_number("hold", hold, 1, integer=True)
@@ -199,7 +194,6 @@ class StickyActionNoise(DecayingActionNoise):
         self.hold = hold
         self.episode_scale = episode_scale
         self.independent = independent
-        self.independent_final = independent if independent_final is None else independent_final
         self.reset()
 
     def reset(self) -> None:
@@ -219,7 +213,7 @@ class StickyActionNoise(DecayingActionNoise):
             self.held = 0
         self.held += 1
         noise = sigma * self.factor * self.x
-        independent = self._decayed(self.independent, self.independent_final)
+        independent = at_step(self.independent, self.t)
         if independent > 0:
             noise = noise + independent * np.random.standard_normal(self.n_actions)
         return noise

@@ -14,6 +14,7 @@ from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuff
 from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
+from sb3_symphony.common.moving import Moving, at_step, check_moving
 from sb3_symphony.common.noise import DecayingNormalActionNoise
 from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, noise_std
 from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
@@ -21,7 +22,6 @@ from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInp
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
 
 SATURATED = 1.5  # before the tanh, whose slope there is 0.18
-Weight = float | tuple[float, float, int, int]  # a number, or one that moves: (initial, final, first step, last step)
 
 
 class Symphony(EnsembleOffPolicyAlgorithm):
@@ -114,7 +114,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         n_critics: int = 2,
         policy_delay: int = 1,
         target_mode: str = "min",
-        min_mix: float | tuple[Weight, Weight] = 1.0,
+        min_mix: float | tuple[Moving, Moving] = 1.0,
         target_policy_noise: float = 0.0,
         saturation_penalty: float = 0.0,
         critic_loss: str = "rehe",
@@ -169,7 +169,10 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
         if critic_learning_rate is not None and not callable(critic_learning_rate):
             check_number("critic_learning_rate", critic_learning_rate, 0)
-        _check_mixes(min_mix)
+        if len(_pair(min_mix)) != 2:
+            raise ValueError(f"min_mix={min_mix!r}: expected a number, or two (target, actor)")
+        for weight in _pair(min_mix):
+            check_moving("min_mix", weight, 0, 1)
         self._set_mixes()
         check_number("target_policy_noise", target_policy_noise, 0)
         check_number("saturation_penalty", saturation_penalty, 0)
@@ -222,7 +225,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
     def _set_mixes(self) -> None:
         """Weights of the minimum, in the target and for the actor, at the present step."""
-        self.target_mix, self.actor_mix = (_weight(each, self.num_timesteps) for each in _pair(self.min_mix))
+        self.target_mix, self.actor_mix = (at_step(each, self.num_timesteps) for each in _pair(self.min_mix))
 
     def _update(self, gradient_steps: int, batch_size: int, logs: dict[str, list[th.Tensor]], **sample_kwargs: Any) -> None:
         # The actor is frozen inside a segment: one forward pass gives all its next actions
@@ -317,30 +320,3 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 def _pair(value: Any) -> Any:
     """``min_mix`` as two weights: in the target and for the actor."""
     return value if isinstance(value, (tuple, list)) else (value, value)
-
-
-def _moving(weight: Any) -> Any:
-    """A weight as ``(initial, final, first step, last step)``."""
-    return weight if isinstance(weight, (tuple, list)) else (weight, weight, 0, 1)
-
-
-def _weight(weight: Weight, step: int) -> float:
-    """Value of a weight of the minimum at a step."""
-    initial, final, start, end = _moving(weight)
-    return float(np.interp(step, (start, end), (initial, final)))
-
-
-def _check_mixes(min_mix: Any) -> None:
-    """Refuse what :func:`_weight` cannot take; here, so that not every call of ``train`` does it."""
-    pair = _pair(min_mix)
-    if len(pair) != 2:
-        raise ValueError(f"min_mix={min_mix!r}: expected a number, or two (target, actor)")
-    for weight in pair:
-        moving = _moving(weight)
-        if len(moving) != 4:
-            raise ValueError(f"min_mix={weight!r}: expected a number, or four (initial, final, first step, last step)")
-        initial, final, start, end = moving
-        check_number("min_mix", initial, 0, 1)
-        check_number("min_mix", final, 0, 1)
-        check_number("min_mix: first step", start, 0, integer=True)
-        check_number("min_mix: last step", end, start + 1, integer=True)
