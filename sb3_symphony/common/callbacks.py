@@ -11,12 +11,14 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, unwrap_vec_normalize
 
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.ensembles import EnsembleCritic
+from sb3_symphony.common.noise import StickyActionNoise
 
 
 class QBias(NamedTuple):
@@ -269,4 +271,61 @@ class QBiasCallback(BaseCallback):
                     f"{self.num_timesteps} steps: normalised Q bias {bias.normalized_mean:+.3f} ± {bias.normalized_std:.3f} "
                     f"({bias.n_pairs} pairs, mean return {bias.mean_return:.4g})"
                 )
+        return True
+
+
+class QuietOnReturn(BaseCallback):
+    """
+    Sets the independent part of :class:`~sb3_symphony.common.noise.StickyActionNoise` by what training episodes return:
+    who does not walk yet needs more of it than who does, whenever that is.
+
+    Between the two returns it is interpolated. What it is set to is kept in the noise and in the model's list of recent
+    episodes, both saved with the model: a resumed training goes on alike.
+
+    :param returns: mean return of recent training episodes at which noise begins to fall, and at which it has fallen, in
+        the environment's units
+    :param independent: standard deviations there, in scaled action units, >= 0
+    :param n_episodes: how many episodes are recent; before there are as many, noise is left as it is
+    :param verbose: see SB3
+    :raises TypeError: at the start of training, if the model's action noise is no ``StickyActionNoise``
+    :raises ValueError: if a number is out of range or returns do not rise
+    """
+
+    def __init__(
+        self,
+        returns: tuple[float, float],
+        independent: tuple[float, float] = (0.2, 0.05),
+        n_episodes: int = 5,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(verbose)
+        for name, pair in (("returns", returns), ("independent", independent)):
+            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+                raise ValueError(f"{name}={pair!r}: expected two numbers")
+            for each in pair:
+                check_number(name, each, 0 if name == "independent" else -np.inf)
+        if not returns[0] < returns[1]:
+            raise ValueError(f"returns={returns!r}: expected the smaller number first")
+        check_number("n_episodes", n_episodes, 1, 100, integer=True)  # SB3 keeps 100 by default
+        self.returns = returns
+        self.independent = independent
+        self.n_episodes = n_episodes
+
+    def _noises(self) -> list[StickyActionNoise]:
+        noise: Any = getattr(self.model, "action_noise", None)
+        noises: list[Any] = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
+        for each in noises:
+            if not isinstance(each, StickyActionNoise):
+                raise TypeError(f"action_noise={each}: expected a StickyActionNoise")
+        return noises
+
+    def _init_callback(self) -> None:
+        self._noises()
+
+    def _on_step(self) -> bool:
+        episodes = self.model.ep_info_buffer
+        if episodes is not None and len(episodes) >= self.n_episodes:
+            recent = np.mean([episodes[-k]["r"] for k in range(1, self.n_episodes + 1)])
+            for noise in self._noises():
+                noise.independent = float(np.interp(recent, self.returns, self.independent))
         return True
