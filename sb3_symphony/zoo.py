@@ -26,7 +26,7 @@ from gymnasium import spaces
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError, RunConfig, RunSettings, TrainOptions, load_config, merge, validated
-from sb3_symphony.experiment.decode import algorithm_arguments
+from sb3_symphony.experiment.decode import algorithm_arguments, class_by_name
 from sb3_symphony.experiment.environment import for_training_only
 from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
 from sb3_symphony.experiment.space import SearchSpace, TuneOptions, read_space
@@ -153,8 +153,11 @@ class SymphonyManager(ExperimentManager):
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.run_config.settings.env_kwargs
         saved = dict(sorted(deepcopy(self.run_config.plain).items()))
-        if self.run_config.settings.env_wrapper:  # in the only form that RL Zoo knows
+        if self.run_config.settings.env_wrapper:  # here and below, in the only form that RL Zoo knows
             saved["env_wrapper"] = [{name: arguments} for name, arguments in self.run_config.settings.env_wrapper]
+        if self.run_config.settings.callback:
+            classes = [(class_by_name("callback", name), arguments) for name, arguments in self.run_config.settings.callback]
+            saved["callback"] = [{f"{class_.__module__}.{class_.__name__}": arguments} for class_, arguments in classes]
         print("Hyperparameters (those that are tuned will be overridden):")
         pprint(saved)
         return deepcopy(saved), saved

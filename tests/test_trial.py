@@ -72,6 +72,12 @@ def test_mean_over_seeds_at_each_evaluation():
     assert descendants(os.getpid()) == [] or not alone.connections
 
 
+def test_a_trial_has_the_callbacks_of_its_configuration():
+    processes = TrialProcesses(options(), config(callback={"QuietOnReturn": {"returns": [0, 1]}}), [3], 2)
+    with pytest.raises(TrialFailed, match="QuietOnReturn: action_noise=None: expected a StickyActionNoise"):
+        followed(processes)
+
+
 @pytest.mark.parametrize(
     "fails, kind, reason",
     [

@@ -175,7 +175,10 @@ def test_shipped_settings_and_a_trained_agent_to_go_on_with(session):
     assert first.n_steps == 3 and isinstance(first.action_noise, StickyActionNoise)  # of the shipped file
     stored = yaml.safe_load((runs / "BipedalWalker-v3_1" / "BipedalWalker-v3" / "config.yml").read_text())
     shipped = yaml.safe_load((Path(__file__).parents[1] / "hyperparams" / "symphony.yml").read_text())["BipedalWalker-v3"]
-    assert stored["env_wrapper"] == shipped["env_wrapper"] and shipped["env_wrapper"]
+    # The same, each with its arguments and under its full name
+    assert stored["env_wrapper"] == [each if isinstance(each, dict) else {each: {}} for each in shipped["env_wrapper"]]
+    (callback,) = shipped["callback"].items()
+    assert stored["callback"] == [{f"sb3_symphony.common.callbacks.{callback[0]}": callback[1]}]
     assert second._n_updates > first._n_updates > 0
 
 

@@ -204,9 +204,16 @@ def _checkpoints(
     )
 
 
-def _configured_callbacks(
-    options: TrainOptions, config: RunConfig, model: BaseAlgorithm, cleanup: ExitStack
-) -> list[BaseCallback]:
+def build_callbacks(options: TrainOptions, config: RunConfig, model: BaseAlgorithm, cleanup: ExitStack) -> list[BaseCallback]:
+    """
+    :param options: options of the command line
+    :param config: its configuration
+    :param model: model that is about to learn
+    :param cleanup: closes the environments of the callbacks
+    :return: the callbacks that the configuration names
+    :raises ConfigError: if one does not fit
+    """
+
     def own_env() -> VecEnv:
         settings = config.settings.model_copy(update={"n_envs": 1})
         env = make_training_env(options.env, settings, getattr(model, "gamma", None), seed=0)
@@ -264,7 +271,7 @@ def prepare(
         evaluation_env = make_evaluation_env(options.env, config.settings, options.eval_env_kwargs)
         cleanup.callback(evaluation_env.close)
         check_same_spaces(env, evaluation_env)
-    callbacks = _configured_callbacks(options, config, model, cleanup)
+    callbacks = build_callbacks(options, config, model, cleanup)
     if fresh and options.trained_agent is not None:
         start_from(model, find_trained(options), options.with_replay_buffer)
     return model, options, evaluation_env, callbacks

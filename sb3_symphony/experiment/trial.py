@@ -13,7 +13,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
 from typing import Any, Literal, NamedTuple
@@ -27,7 +27,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_symphony.experiment.callbacks import SeededEvaluation, StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
 from sb3_symphony.experiment.environment import make_evaluation_env
-from sb3_symphony.experiment.train import build_model
+from sb3_symphony.experiment.train import build_callbacks, build_model
 
 
 class TrialFailed(Exception):
@@ -124,7 +124,8 @@ def _train_seed(options: TrainOptions, config: RunConfig, seed: int, n_evaluatio
             eval_freq=evaluation_frequency(config, n_evaluations),
             verbose=0,
         )
-        model.learn(config.settings.n_timesteps, callback=evaluation)
+        with ExitStack() as cleanup:
+            model.learn(config.settings.n_timesteps, [evaluation, *build_callbacks(options, config, model, cleanup)])
     except BrokenPipeError:
         sys.exit(1)  # nobody wants the results any more
     except Exception as error:
