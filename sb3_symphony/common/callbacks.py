@@ -299,11 +299,11 @@ class QuietOnReturn(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        for name, pair in (("returns", returns), ("independent", independent)):
+        for name, pair, low in (("returns", returns, -np.inf), ("independent", independent, 0)):
             if not isinstance(pair, (tuple, list)) or len(pair) != 2:
                 raise ValueError(f"{name}={pair!r}: expected two numbers")
             for each in pair:
-                check_number(name, each, 0 if name == "independent" else -np.inf)
+                check_number(name, each, low)
         if not returns[0] < returns[1]:
             raise ValueError(f"returns={returns!r}: expected the smaller number first")
         check_number("n_episodes", n_episodes, 1, 100, integer=True)  # SB3 keeps 100 by default

@@ -180,6 +180,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         """Priority of a transition: its error averaged over the critics. Nothing to do for other buffers."""
         if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
             error = (target - q_values).abs().mean(dim=0)  # (batch, 1)
+            # Samples of this buffer, and of no other, have indices
             self.replay_buffer.update_priorities(batch.indices, error.flatten().cpu().numpy())  # type: ignore[attr-defined]
 
     def _discounts(self, batch: ReplayBufferSamples) -> th.Tensor | float:
