@@ -16,7 +16,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, unwrap_vec_normalize
 
-from sb3_symphony.common.checks import check_number
+from sb3_symphony.common.checks import check_number, check_pair
 from sb3_symphony.common.ensembles import EnsembleCritic
 from sb3_symphony.common.noise import StickyActionNoise
 
@@ -299,11 +299,8 @@ class QuietOnReturn(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
-        for name, pair, low in (("returns", returns, -np.inf), ("independent", independent, 0)):
-            if not isinstance(pair, (tuple, list)) or len(pair) != 2:
-                raise ValueError(f"{name}={pair!r}: expected two numbers")
-            for each in pair:
-                check_number(name, each, low)
+        check_pair("returns", returns, "where noise begins to fall, where it has fallen")
+        check_pair("independent", independent, "before, after", 0)
         if not returns[0] < returns[1]:
             raise ValueError(f"returns={returns!r}: expected the smaller number first")
         check_number("n_episodes", n_episodes, 1, 100, integer=True)  # SB3 keeps 100 by default

@@ -32,6 +32,27 @@ def check_number(
         raise ValueError(message)
 
 
+def check_pair(
+    name: str, value: Any, parts: str, low: float = -math.inf, high: float = math.inf, integer: bool = False
+) -> None:
+    """
+    Refuse anything but two finite numbers in ``[low, high]``.
+
+    :param name: The argument's name
+    :param value: Its value
+    :param parts: What the two are, for the message
+    :param low: Smallest value allowed
+    :param high: Largest value allowed
+    :param integer: Whether only whole numbers are allowed
+    :raises TypeError: if one of the two is no number (of the kind asked for)
+    :raises ValueError: if there are not two, or one is not finite or out of range
+    """
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        raise ValueError(f"{name}={value!r}: expected two numbers ({parts})")
+    for number in value:
+        check_number(name, number, low, high, integer)
+
+
 def check_choice(name: str, value: Any, options: Iterable[Any]) -> None:
     """
     Refuse a value that is not one of the options.

@@ -13,7 +13,7 @@ from abc import abstractmethod
 import numpy as np
 from stable_baselines3.common.noise import ActionNoise
 
-from sb3_symphony.common.checks import check_choice, check_number
+from sb3_symphony.common.checks import check_choice, check_number, check_pair
 from sb3_symphony.common.moving import Moving, at_step, check_moving
 
 DECAYS = ("cosine", "linear", "tanh", "constant")
@@ -184,10 +184,7 @@ class StickyActionNoise(DecayingActionNoise):
         if not 0 <= correlation < 1:
             raise ValueError(f"correlation={correlation!r}: expected a number in [0, 1)")
         check_number("hold", hold, 1, integer=True)
-        if not isinstance(episode_scale, (tuple, list)) or len(episode_scale) != 2:
-            raise ValueError(f"episode_scale={episode_scale!r}: expected two numbers (smallest, largest)")
-        for factor in episode_scale:
-            check_number("episode_scale", factor, 0)
+        check_pair("episode_scale", episode_scale, "smallest, largest", 0)
         if episode_scale[0] > episode_scale[1]:
             raise ValueError(f"episode_scale={episode_scale!r}: expected the smaller number first")
         self.correlation = correlation

@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch.nn import functional as F
 
 from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
-from sb3_symphony.common.checks import check_choice, check_number
+from sb3_symphony.common.checks import check_choice, check_number, check_pair
 from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
 from sb3_symphony.common.moving import Moving, at_step, check_moving
@@ -177,10 +177,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         check_number("target_policy_noise", target_policy_noise, 0)
         check_number("saturation_penalty", saturation_penalty, 0)
         check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
-        if not isinstance(initial_gradient_steps, (tuple, list)) or len(initial_gradient_steps) != 2:
-            raise ValueError(f"initial_gradient_steps={initial_gradient_steps!r}: expected two numbers (uniform, faded)")
-        for n_updates in initial_gradient_steps:
-            check_number("initial_gradient_steps", n_updates, 0, integer=True)
+        check_pair("initial_gradient_steps", initial_gradient_steps, "uniform, faded", 0, integer=True)
         check_number("episode_gradient_steps", episode_gradient_steps, 0, integer=True)
         check_choice("warmup_policy", warmup_policy, ("actor", "uniform"))
         if isinstance(action_noise, str):
