@@ -1,6 +1,7 @@
 """``bench`` with what goes beyond a grid: conditions, searches, agents to start from, algorithms of one's own, figures."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -214,6 +215,14 @@ def test_raw_files_give_the_same_tables(study, tmp_path, fails):
     for flag in ("--collect", "--page"):
         (tmp_path / "page.md").write_text("<!-- results -->\n<!-- /results -->\n")
         fails(["bench", str(study / "study.yml"), flag, str(tmp_path / "page.md")], f"{flag}: ", "belongs to --report")
+
+
+def test_raw_files_of_moved_results(study, tmp_path):
+    moved, raw = tmp_path / "moved", tmp_path / "raw"
+    shutil.copytree(study / "results", moved)
+    assert main(["bench", str(study / "study.yml"), "--report", "-f", str(moved), "--collect", str(raw)]) == 0
+    files = [path for path in raw.rglob("*") if path.is_file()]
+    assert not any(str(folder).encode() in path.read_bytes() for path in files for folder in (study, moved))
 
 
 def test_only_some_algorithms(study, tmp_path, capsys, fails):

@@ -1,5 +1,6 @@
 """What came out of a grid: tables, figures, pages, and the raw files that are worth keeping."""
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.cell import read_result
-from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.config import ConfigError, read_yaml
 from sb3_symphony.experiment.grid_progress import Progress
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.study import Drawing, Environment, Study
@@ -33,10 +34,14 @@ def collect(progress: Sequence[Progress], folder: Path, target: Path) -> None:
         raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
     found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
     found += [path for pattern in _RAW_BESIDE for path in folder.glob(pattern)]
+    recorded = [read_yaml(path, "options").get("log_folder", "") for path in found if path.name == "args.yml"]
+    # The results may have been moved since. Longest first, as one may be the beginning of another
+    folders = sorted({str(folder), *filter(os.path.isabs, recorded)}, key=len, reverse=True)
     for path in found:
         content = path.read_bytes()
         if path.suffix == ".yml":
-            content = content.replace(f"{folder}/".encode(), b"").replace(str(folder).encode(), b".")
+            for name in folders:
+                content = content.replace(f"{name}/".encode(), b"").replace(name.encode(), b".")
         copy = target / path.relative_to(folder)
         try:
             copy.parent.mkdir(parents=True, exist_ok=True)
