@@ -34,7 +34,7 @@ def collect(progress: Sequence[Progress], folder: Path, target: Path) -> None:
         raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
     found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
     found += [path for pattern in _RAW_BESIDE for path in folder.glob(pattern)]
-    recorded = [read_yaml(path, "options").get("log_folder", "") for path in found if path.name == "args.yml"]
+    recorded = [read_yaml(path).get("log_folder", "") for path in found if path.name == "args.yml"]
     # The results may have been moved since. Longest first, as one may be the beginning of another
     folders = sorted({str(folder), *filter(os.path.isabs, recorded)}, key=len, reverse=True)
     for path in found:
