@@ -19,6 +19,7 @@ from sb3_symphony.common.buffers import (
     PrioritizedReplayBuffer,
     SumTree,
     draw_faded_ages,
+    end_trajectory,
     fade_weights,
 )
 
@@ -233,6 +234,26 @@ def test_first_steps_that_are_all_overwritten():
     assert set(buffer.sample(100).observations[:, 0].tolist()) == {1, 2}  # the oldest never
     fill(buffer, 4)  # overwritten in the same episode
     assert set(buffer.sample(200).observations[:, 0].tolist()) == {0, 1, 2, 3}
+
+
+def test_an_ended_trajectory_is_followed_by_first_steps():
+    buffer = FadingReplayBuffer(100, OBS, ACT, start_share=1.0, start_steps=2)
+    fill(buffer, 10)
+    end_trajectory(buffer)
+    fill(buffer, 10)
+    assert set(buffer.sample(200).observations[:, 0].tolist()) == {0, 1}  # 0 is of the second: the oldest is never drawn
+
+
+@pytest.mark.parametrize("done, timeout", [(0, 0), (1, 0), (1, 1)])
+def test_an_ended_trajectory_stays_terminated_if_it_was(done, timeout):
+    buffer = NStepReplayBuffer(20, OBS, ACT, n_steps=3, gamma=0.5)
+    fill(buffer, 10, np.array([[0.0]] * 9 + [[done]]), np.array([[0.0]] * 9 + [[timeout]]))
+    end_trajectory(buffer)
+    fill(buffer, 3)
+    samples = buffer._get_samples(np.array([8]))
+    rewards = buffer.rewards[8:10, 0]
+    assert samples.rewards.item() == rewards[0] + 0.5 * rewards[1] and samples.discounts.item() == 0.25
+    assert samples.dones.item() == (done and not timeout)
 
 
 def test_samples_are_copies():

@@ -9,8 +9,8 @@ from gymnasium import spaces
 from resume_helpers import difference
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
-from sb3_symphony.common.buffers import FadingReplayBuffer, SumTree
-from sb3_symphony.common.replay_files import ReplaySegments, end_trajectory
+from sb3_symphony.common.buffers import SumTree
+from sb3_symphony.common.replay_files import ReplaySegments
 
 BOX = spaces.Box(-1.0, 1.0, (3,))
 DICT = spaces.Dict({"a": BOX, "b": spaces.Box(0, 255, (2, 2), np.uint8)})
@@ -85,20 +85,6 @@ def test_a_segment_holds_only_what_is_new(tmp_path, monkeypatch):
         sizes.append((tmp_path / segments.save(buffer, rows)[-1].file).stat().st_size)
     assert sizes[1] == pytest.approx(sizes[2], rel=0.01) == pytest.approx(sizes[4], rel=0.01)
     assert sizes[0] > 7 * sizes[1] and sizes[3] > 14 * sizes[1]
-
-
-def test_an_ended_trajectory_is_followed_by_first_steps(tmp_path):
-    buffer = FadingReplayBuffer(100, BOX, BOX, device="cpu", start_share=1.0, start_steps=2)
-    zeros = np.zeros((1, 3))
-
-    def add(steps):
-        for step in steps:
-            buffer.add(zeros + step, zeros, zeros, np.zeros(1), np.zeros(1), [{}])
-
-    add(range(10))
-    end_trajectory(buffer, ReplaySegments(tmp_path))
-    add(range(10, 20))
-    assert set(buffer.sample(200).observations[:, 0].tolist()) == {1, 10, 11}  # 0 is the oldest: never drawn
 
 
 def test_sum_tree_is_pickled_without_what_is_empty():

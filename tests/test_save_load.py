@@ -367,6 +367,22 @@ def test_set_env(make, pendulum):
     assert model._last_obs is not None
 
 
+@pytest.mark.parametrize("reset", [True, False])
+def test_returns_end_where_an_episode_is_given_up(make, pendulum, reset):
+    """The environment is reset in the middle of an episode: three-step returns must not reach into the next one."""
+    model = make(n_steps=3, gamma=0.5).learn(60)  # episodes of 25 steps
+    model.learn(10, reset_num_timesteps=False)  # goes on in its episode
+    model.set_env(pendulum(), force_reset=not reset)
+    model.learn(20, reset_num_timesteps=reset)
+    samples = model.replay_buffer._get_samples(np.arange(90))
+    lengths = np.log(samples.discounts.flatten().numpy()) / np.log(0.5)
+    expected = np.full(90, 3.0)
+    for end in (25, 50, 70, 90):
+        expected[end - 2 : end] = 2, 1
+    np.testing.assert_allclose(lengths, expected, rtol=1e-6)
+    assert not samples.dones.any()  # Pendulum never terminates
+
+
 def test_wrong_spaces(make, algorithm, tmp_path):
     make().save(tmp_path / "model")
     with pytest.raises(ValueError, match="spaces do not match"):

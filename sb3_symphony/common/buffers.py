@@ -18,6 +18,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.mirror import Mirror
@@ -377,6 +378,26 @@ class FadingDictReplayBuffer(_FadedSampling, DictReplayBuffer):
             fade_factor=fade_factor,
             fade_power=fade_power,
         )
+
+
+def end_trajectory(buffer: ReplayBuffer) -> None:
+    """
+    Mark that the latest transition is not followed by the next one to come: the environments start anew.
+
+    :param buffer: replay buffer
+    """
+    if buffer.size() == 0:
+        return
+    if isinstance(buffer, HerReplayBuffer):
+        buffer.truncate_last_trajectory()
+    elif isinstance(buffer, NStepReplayBuffer) or buffer.optimize_memory_usage:
+        # Others need no mark: they bootstrap from the next observation that they stored
+        last = buffer.pos - 1
+        if buffer.handle_timeout_termination:
+            buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], buffer.dones[last] == 0)
+        buffer.dones[last] = 1
+    if isinstance(buffer, FadingReplayBuffer):
+        buffer.episode_steps[:] = 0
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -34,10 +34,11 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_symphony import __version__
+from sb3_symphony.common.buffers import end_trajectory
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.files import DamagedFile, checked_content, seal, unseal
 from sb3_symphony.common.recording import each_copy, is_recorded, restore_vec_env, vec_env_state
-from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, end_trajectory, restore_buffer
+from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, restore_buffer
 
 # ----------------------------------------------------------------------------------------------------------------------
 # State
@@ -368,5 +369,6 @@ class ExactCheckpoints(BaseCallback):
             model._last_original_obs = model.get_vec_normalize_env().get_original_obs()
         if getattr(model, "action_noise", None) is not None:
             model.action_noise.reset()
-        if self._buffer is not None and self._buffer.size() > 0:
-            end_trajectory(self._buffer, self.segments)
+        if self._buffer is not None:
+            end_trajectory(self._buffer)
+            self.segments.forget_latest()

@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
 
-from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer
+from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer, end_trajectory
 from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CRITIC_LOSSES
@@ -143,7 +143,11 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         for each in noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]:
             if isinstance(each, DecayingActionNoise):
                 each.n_envs = self.env.num_envs  # a decay counts environment steps
-        return super()._setup_learn(*args, **kwargs)
+        last_obs = self._last_obs
+        result = super()._setup_learn(*args, **kwargs)
+        if self._last_obs is not last_obs and self.replay_buffer is not None:  # the environments were reset
+            end_trajectory(self.replay_buffer)
+        return result
 
     # ---------------------------------------------------------------- training
 

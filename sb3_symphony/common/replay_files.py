@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_symphony.common.buffers import FadingReplayBuffer
+from sb3_symphony.common.buffers import end_trajectory
 from sb3_symphony.common.files import seal, unseal
 
 _STORAGE = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -76,6 +76,10 @@ class ReplaySegments:
             self.saved = rows
         self.segments = [segment for segment in self.segments if segment.stop > first]
         return list(self.segments)
+
+    def forget_latest(self) -> None:
+        """The latest row has changed: it is to be written again."""
+        self.saved = max(self.saved - 1, 0)
 
     def load(self, buffer: ReplayBuffer) -> None:
         """
@@ -151,7 +155,7 @@ def add_transitions(buffer: ReplayBuffer, parts: Iterable[dict[str, np.ndarray]]
             rows["dones"][row],
             [{"TimeLimit.truncated": bool(cut)} for cut in rows["timeouts"][row]],
         )
-    end_trajectory(buffer, ReplaySegments(Path()))
+    end_trajectory(buffer)
     return count
 
 
@@ -189,22 +193,3 @@ def restore_buffer(buffer: ReplayBuffer, state: dict[str, Any], segments: Replay
             setattr(buffer, name, value)
     for name, array in _storage(buffer):
         array[buffer.pos] = state["next row"][name]
-
-
-def end_trajectory(buffer: ReplayBuffer, segments: ReplaySegments) -> None:
-    """
-    Mark that the latest transition is not followed by the next one to come: the environments start anew.
-
-    :param buffer: replay buffer
-    :param segments: its transitions on disk
-    """
-    last = (buffer.pos - 1) % buffer.buffer_size
-    if isinstance(buffer, HerReplayBuffer):
-        buffer.truncate_last_trajectory()
-    elif isinstance(buffer, NStepReplayBuffer) or buffer.optimize_memory_usage:
-        # Others need no mark: they bootstrap from the next observation that they stored
-        buffer.dones[last] = True
-        buffer.timeouts[last] = buffer.handle_timeout_termination
-    if isinstance(buffer, FadingReplayBuffer):
-        buffer.episode_steps[:] = 0
-    segments.saved = max(segments.saved - 1, 0)  # that row is to be written again
