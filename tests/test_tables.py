@@ -148,7 +148,7 @@ def test_a_row_for_each_run(result):
     assert (a["final_episodes"], a["final_mean"], a["final_std"], a["final_iqm"]) == ("2", "2.0", "1.0", "2.0")
     assert (a["steps"], a["updates"], a["seconds"], a["threshold"]) == ("1500", "100", "3700.0", "300.0")
     assert (b["protocol"], b["done"], b["stable_reached"], b["best_episode"]) == ("non-standard", "0", "0", "10.0")
-    assert (c["done"], c["stable_step"], c["best_episode"], c["final_mean"]) == ("0", "", "", "")
+    assert (c["protocol"], c["done"], c["stable_step"], c["best_episode"], c["final_mean"]) == ("", "0", "", "", "")
 
 
 def test_a_row_for_each_episode(result):

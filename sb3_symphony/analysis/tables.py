@@ -176,7 +176,7 @@ def run_row(result: Result) -> Row:
     final = summarise(result.final) if len(result.final) else None
     return {
         **_of(result),
-        "protocol": "standard" if result.standard else "non-standard",
+        "protocol": None if result.run is None else "standard" if result.standard else "non-standard",
         "done": int(result.summary is not None),
         "steps": summary.get("steps"),
         "updates": summary.get("updates"),
