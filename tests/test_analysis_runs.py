@@ -5,7 +5,16 @@ import pytest
 import yaml
 from torch.utils.tensorboard import SummaryWriter
 
-from sb3_symphony.analysis.runs import find_runs, group_runs, open_run, read_episodes, read_evaluations, read_scalars
+from sb3_symphony.analysis.runs import (
+    Scalar,
+    find_runs,
+    group_runs,
+    open_run,
+    read_episodes,
+    read_evaluations,
+    read_scalars,
+)
+from sb3_symphony.analysis.tables import scalar_table
 
 
 def write_monitor(path, start, rows, columns="r,l,t"):
@@ -80,6 +89,27 @@ def test_scalars_are_not_thinned(tmp_path):
     np.testing.assert_array_equal(scalar.steps, np.arange(0, 30_000, 10))
     np.testing.assert_allclose(scalar.values, scalar.steps**0.5, rtol=1e-6)
     np.testing.assert_allclose(np.diff(scalar.seconds), 10.0)
+
+
+def test_scalars_as_a_table(tmp_path):
+    logged = {
+        "train/x": Scalar(np.array([0, 8, 8, 16]), np.array([0.0, 1.0, 1.5, 2.0]), np.array([1.0, np.nan, 1 / 3, -2e-9])),
+        "rollout/y": Scalar(np.array([8, 24]), np.array([1.0, 3.25]), np.array([1e6, 7.0])),
+    }
+    path = tmp_path / "X_1" / "scalars.csv"
+    write_monitor(path.with_name("0.monitor.csv"), 0.0, [])
+    path.write_text(scalar_table(logged))
+    assert path.read_text().splitlines()[:3] == ["step,seconds,train/x,rollout/y", "0,0.00,1,", "8,1.00,nan,1e+06"]
+    read = open_run(path.parent).scalars
+    assert list(read) == list(logged)
+    for tag, scalar in logged.items():
+        np.testing.assert_array_equal(read[tag].steps, scalar.steps)
+        np.testing.assert_array_equal(read[tag].seconds, scalar.seconds)
+        np.testing.assert_allclose(read[tag].values, scalar.values, rtol=1e-5)
+    assert scalar_table(read) == path.read_text()
+    path.write_text("step,seconds,train/x\n8,1.0,high\n")
+    with pytest.raises(ValueError, match=r"scalars\.csv: no table of scalars, or damaged"):
+        _ = open_run(path.parent).scalars
 
 
 # ---------------------------------------------------------------- folders

@@ -77,7 +77,7 @@ STUDY = {
     },
     "figures": {
         "lengths": {"y_axis": "length", "algorithms": ["base", "own"]},
-        "rates": {"tags": ["train/learning_rate"]},
+        "rates": {"tags": ["train/learning_rate"], "algorithms": ["base", "own"]},
         "speeds": {"tags": ["time/speed"]},
     },
 }
@@ -212,6 +212,10 @@ def test_raw_files_give_the_same_tables(study, tmp_path, fails):
     assert main(["bench", str(study / "study.yml"), "--report", "-f", str(raw)]) == 0
     for name in ("table.md", "cells.csv", "episodes.csv", "matrix.csv"):
         assert (raw / name).read_text() == (results / name).read_text()
+    kept, logged = (open_run(folder / "base" / "Pendulum-v1_3").scalars for folder in (raw, results))
+    assert set(kept) == {"train/learning_rate"} < set(logged)  # what a figure draws
+    np.testing.assert_array_equal(kept["train/learning_rate"].steps, logged["train/learning_rate"].steps)
+    assert (raw / "rates.png").exists() and not (raw / "onward" / "Pendulum-v1_3" / "scalars.csv").exists()
     for flag in ("--collect", "--page"):
         (tmp_path / "page.md").write_text("<!-- results -->\n<!-- /results -->\n")
         fails(["bench", str(study / "study.yml"), flag, str(tmp_path / "page.md")], f"{flag}: ", "belongs to --report")

@@ -152,6 +152,28 @@ def read_scalars(folder: Path) -> dict[str, Scalar]:
     return scalars
 
 
+def read_scalar_table(path: Path) -> dict[str, Scalar]:
+    """
+    Read scalars that were copied out of a TensorBoard log, see :func:`~sb3_symphony.analysis.tables.scalar_table`.
+
+    :param path: a ``scalars.csv``
+    :return: name of each quantity → its course
+    :raises ValueError: if the file is something else
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as lines:
+            table = csv.DictReader(lines)
+            rows = list(table)
+        scalars = {}
+        for tag in [name for name in table.fieldnames or [] if name not in ("step", "seconds")]:
+            points = np.array([[float(row[key]) for key in ("step", "seconds", tag)] for row in rows if row[tag] != ""])
+            steps, seconds, values = points.reshape(-1, 3).T
+            scalars[tag] = Scalar(steps.astype(np.int64), seconds, values)
+        return scalars
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise ValueError(f"{path}: no table of scalars, or damaged — {error}") from None
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Runs
 # ----------------------------------------------------------------------------------------------------------------------
@@ -191,8 +213,10 @@ class Run:
 
     @cached_property
     def scalars(self) -> dict[str, Scalar]:
-        """Scalars of the TensorBoard log, see :func:`read_scalars`; empty if there is none."""
-        return read_scalars(self.log) if self.log else {}
+        """Scalars of the TensorBoard log, see :func:`read_scalars`, or copied out of it; empty if there are none."""
+        if self.log:
+            return read_scalars(self.log)
+        return read_scalar_table(path) if (path := self.path / "scalars.csv").exists() else {}
 
 
 def _plain_mapping(path: Path) -> dict[str, Any]:

@@ -8,14 +8,15 @@ depends on what it would have done is written "> n".
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from sb3_symphony.analysis.runs import Run
+from sb3_symphony.analysis.runs import Run, Scalar
 from sb3_symphony.analysis.statistics import Event, RunEvents, iqm, iqm_event, median_event, run_events, summarise
 
 #: environment seed of the first evaluation episode
@@ -106,6 +107,23 @@ def as_csv(columns: Iterable[str], rows: Iterable[Row]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
+
+
+def scalar_table(scalars: Mapping[str, Scalar]) -> str:
+    """
+    Scalars as text, for a ``scalars.csv``: one row for each time that some were logged, with six digits.
+
+    :param scalars: name of each quantity → its course
+    :return: columns ``step`` and ``seconds``, then one for each quantity, empty where it was not logged
+    """
+    rows: dict[tuple[int, int], Row] = {}
+    for tag, scalar in scalars.items():
+        seen: Counter[int] = Counter()  # several parallel episodes may end at the same step
+        for step, seconds, value in zip(scalar.steps.tolist(), scalar.seconds.tolist(), scalar.values.tolist(), strict=True):
+            row = rows.setdefault((step, seen[step]), {"step": step, "seconds": f"{seconds:.2f}"})
+            row[tag] = f"{value:.6g}"
+            seen[step] += 1
+    return as_csv(["step", "seconds", *scalars], [rows[key] for key in sorted(rows)])
 
 
 def _of(result: Result) -> Row:

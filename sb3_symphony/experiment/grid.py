@@ -126,7 +126,7 @@ def bench(options: BenchOptions) -> BenchResult:
         if options.page is not None:
             write_output(Path(options.page), on_page(options.page, table).encode(), "--page")
         if options.collect is not None:
-            collect(progress, folder, output_folder(Path(options.collect).absolute(), "--collect"))
+            collect(study, progress, folder, output_folder(Path(options.collect).absolute(), "--collect"))
         return BenchResult(folder, table)
     return _run(options, study, progress, folder, path)
 

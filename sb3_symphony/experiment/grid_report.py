@@ -14,6 +14,7 @@ from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.study import Drawing, Environment, Study
 
 if TYPE_CHECKING:
+    from sb3_symphony.analysis.runs import Scalar
     from sb3_symphony.analysis.tables import Result
 
 #: files of a run, and beside the runs, that a report needs or that tell what a search has found
@@ -21,33 +22,55 @@ _RAW = ("*/args.yml", "*/config.yml", "*.monitor.csv", "evaluations.npz", "resul
 _RAW_BESIDE = ("settings/*_best_of_*.yml", "sweeps/*/tune/*/*.csv", "sweeps/*/tune/*/best.yml", "sweeps/*/tune/*/*.png")
 
 
-def collect(progress: Sequence[Progress], folder: Path, target: Path) -> None:
+def collect(study: Study, progress: Sequence[Progress], folder: Path, target: Path) -> None:
     """
-    Copy what is small and worth keeping. Text loses the names of folders of this machine.
+    Copy what is small and worth keeping. Text loses the names of folders of this machine. Of TensorBoard logs only what the
+    study's figures draw is kept, as tables; of figures that are drawn of models, which are not small, the figures.
 
+    :param study: the study
     :param progress: all cells of the study
     :param folder: where their run folders are
     :param target: where the copies go
     :raises ConfigError: if that is the same folder, or cannot be written
     """
+    from sb3_symphony.analysis.tables import scalar_table
+
     if target == folder:
         raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
     found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
-    found += [path for pattern in _RAW_BESIDE for path in folder.glob(pattern)]
+    of_models = [f"{name}.*" for name, figure in study.figures.items() if figure.gait_at is not None]
+    found += [path for pattern in (*_RAW_BESIDE, *of_models) for path in folder.glob(pattern)]
     recorded = [read_yaml(path).get("log_folder", "") for path in found if path.name == "args.yml"]
     # The results may have been moved since. Longest first, as one may be the beginning of another
     folders = sorted({str(folder), *filter(os.path.isabs, recorded)}, key=len, reverse=True)
+    contents = {path: path.read_bytes() for path in found}
     for path in found:
-        content = path.read_bytes()
         if path.suffix == ".yml":
             for name in folders:
-                content = content.replace(f"{name}/".encode(), b"").replace(name.encode(), b".")
+                contents[path] = contents[path].replace(f"{name}/".encode(), b"").replace(name.encode(), b".")
+    for each in progress:
+        if scalars := _drawn_scalars(study, each):
+            contents[each.run.path / "scalars.csv"] = scalar_table(scalars).encode()
+    for path, content in contents.items():
         copy = target / path.relative_to(folder)
         try:
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(content)
         except OSError as error:
             raise ConfigError(f"--collect: '{copy}' cannot be written — {error.strerror}") from None
+
+
+def _drawn_scalars(study: Study, progress: Progress) -> dict[str, "Scalar"]:
+    """What a run has logged and a figure draws."""
+    from sb3_symphony.analysis.runs import open_run
+
+    algorithm = progress.cell.algorithm
+    figures = [each for each in study.figures.values() if algorithm in (each.algorithms or [algorithm])]
+    figures = [each for each in figures if each.kind == "scalars"]
+    if not figures or not (progress.run.details / "args.yml").is_file():
+        return {}
+    logged = open_run(progress.run.path).scalars
+    return {tag: logged[tag] for tag in logged if any(tag in (each.tags or logged) for each in figures)}
 
 
 _PAGE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- /results -->)", re.DOTALL)
