@@ -23,7 +23,7 @@ def test_agent(run, tmp_path, monkeypatch, capsys):
     assert result.selection.run == run
     assert max(episode.reward for episode in result.episodes) > 250  # it walks to the end; one may stumble
     assert "pickled" not in capsys.readouterr().err
-    assert sum(path.stat().st_size for path in run.rglob("*")) < 1_100_000
+    assert sum(path.stat().st_size for path in run.rglob("*")) < 1_000_000
 
 
 def test_enjoy_without_training(tmp_path, monkeypatch, capsys):
