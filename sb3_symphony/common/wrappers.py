@@ -355,7 +355,8 @@ class TorsoMass(gym.Wrapper):
         import mujoco
 
         self.mass = float(mass)
-        model: Any = self.env.unwrapped.model  # type: ignore[attr-defined]  # a MuJoCo environment
+        unwrapped: Any = self.env.unwrapped  # a MuJoCo environment
+        model = unwrapped.model
         model.body_mass[self.body] = self.mass
         mujoco.mj_setConst(model, mujoco.MjData(model))  # on scratch data: it overwrites the state
 
@@ -396,7 +397,8 @@ class LegMass(gym.Wrapper):
         :return: first observation and info
         """
         result = self.env.reset(seed=seed, options=options)
-        for leg in self.env.unwrapped.legs:  # type: ignore[attr-defined]  # bodies that this reset has made
+        walker: Any = self.env.unwrapped
+        for leg in walker.legs:  # bodies that this reset has made
             for fixture in leg.fixtures:
                 fixture.density *= self.factor
             leg.ResetMassData()

@@ -14,7 +14,7 @@ from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.study import Drawing, Environment, Study
 
 if TYPE_CHECKING:
-    from sb3_symphony.analysis.runs import Scalar
+    from sb3_symphony.analysis.runs import Run, Scalar
     from sb3_symphony.analysis.tables import Result
 
 #: files of a run, and beside the runs, that a report needs or that tell what a search has found
@@ -62,15 +62,18 @@ def collect(study: Study, progress: Sequence[Progress], folder: Path, target: Pa
 
 def _drawn_scalars(study: Study, progress: Progress) -> dict[str, "Scalar"]:
     """What a run has logged and a figure draws."""
+    cell = progress.cell
+    figures = [each for each in study.figures.values() if each.kind == "scalars"]
+    figures = [each for each in figures if each.shows(cell.algorithm, cell.environment.id)]
+    run = _run_of(progress) if figures else None
+    logged = {} if run is None else run.scalars
+    return {tag: logged[tag] for tag in logged if any(tag in (each.tags or logged) for each in figures)}
+
+
+def _run_of(progress: Progress) -> "Run | None":
     from sb3_symphony.analysis.runs import open_run
 
-    algorithm = progress.cell.algorithm
-    figures = [each for each in study.figures.values() if algorithm in (each.algorithms or [algorithm])]
-    figures = [each for each in figures if each.kind == "scalars"]
-    if not figures or not (progress.run.details / "args.yml").is_file():
-        return {}
-    logged = open_run(progress.run.path).scalars
-    return {tag: logged[tag] for tag in logged if any(tag in (each.tags or logged) for each in figures)}
+    return open_run(progress.run.path) if (progress.run.details / "args.yml").is_file() else None
 
 
 _PAGE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- /results -->)", re.DOTALL)
@@ -139,17 +142,16 @@ def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:
 
 
 def result_of(progress: Progress) -> "Result":
-    from sb3_symphony.analysis.runs import open_run
     from sb3_symphony.analysis.tables import Result
 
-    run, cell = progress.run, progress.cell
+    cell = progress.cell
     return Result(
         cell.algorithm,
         cell.environment.id,
         cell.seed,
         _thresholds(cell.environment),
-        open_run(run.path) if (run.details / "args.yml").is_file() else None,
-        read_result(run.path) if progress.state == "done" else None,
+        _run_of(progress),
+        read_result(progress.run.path) if progress.state == "done" else None,
         progress.reported,
     )
 
@@ -199,13 +201,7 @@ def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
 def _draw_figures(study: Study, results: Sequence["Result"], folder: Path) -> None:
     """The study's own figures, of what there is to draw: a figure whose runs have not recorded it stays as it is."""
     for name, figure in study.figures.items():
-        own = [
-            each
-            for each in results
-            if each.run is not None
-            and each.algorithm in (figure.algorithms or [each.algorithm])
-            and each.environment in (figure.environments or [each.environment])
-        ]
+        own = [each for each in results if each.run is not None and figure.shows(each.algorithm, each.environment)]
         if not own:
             continue
         try:

@@ -185,7 +185,7 @@ def _scalar_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, li
         f"{run.path}: no TensorBoard log is known — `train -tb` writes one; a log's own folder can be given instead"
         for group in groups
         for run in group.runs
-        if not run.scalars and run.log is None
+        if run.log is None and not run.scalars
     ]
     for tag in options.tags or [tag for tag in SCALARS if tag in logged] or sorted(logged):
         for group in groups:

@@ -273,6 +273,10 @@ class Drawing(PlotOptions):
     environments: _List[str] | None = None
     gait_at: Count | None = None
 
+    def shows(self, algorithm: str, environment: str) -> bool:
+        """Whether it is about the runs of that algorithm on that environment."""
+        return algorithm in (self.algorithms or [algorithm]) and environment in (self.environments or [environment])
+
 
 class Study(BaseModel):
     """
