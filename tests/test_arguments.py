@@ -299,3 +299,74 @@ def test_edges_are_allowed(make):
 def test_noise_of_a_wrong_size(make):
     with pytest.raises(ValueError):
         make(action_noise=NormalActionNoise(np.zeros(3), np.ones(3))).learn(30)
+
+
+LOADED_WRONGLY = [
+    dict(n_critics=7),
+    dict(target_mode="man"),
+    dict(critic_reduction="ensemble"),
+    dict(policy_delay=0),
+    dict(critic_loss="msee"),
+    dict(tau=7.0),
+    dict(batch_size=0),
+    dict(action_noise="pink"),
+]
+
+
+@pytest.mark.parametrize("wrong", LOADED_WRONGLY, ids=lambda wrong: next(iter(wrong)))
+def test_arguments_of_load(make, algorithm, tmp_path, wrong):
+    """They replace the saved ones, and are looked at like those of a new model."""
+    make().save(tmp_path / "model")
+    with pytest.raises((ValueError, TypeError), match=f"{next(iter(wrong))}="):
+        algorithm.load(tmp_path / "model", **wrong)
+
+
+def test_own_arguments_of_load(small, tmp_path):
+    small(REDQ).save(tmp_path / "redq")
+    with pytest.raises(ValueError, match="subset_size=20: expected at most n_critics=3"):
+        REDQ.load(tmp_path / "redq", subset_size=20)
+    small(Symphony).save(tmp_path / "symphony")
+    with pytest.raises(ValueError, match="did you mean 'rehae'"):
+        Symphony.load(tmp_path / "symphony", actor_loss="rehaee")
+
+
+def test_a_noise_is_an_object(small):
+    with pytest.raises(TypeError, match="action_noise='default': expected an ActionNoise or None"):
+        small(REDQ, action_noise="default")
+    with pytest.raises(ValueError, match=r"action_noise='defalt': expected one of 'default': did you mean 'default'\?"):
+        small(Symphony, action_noise="defalt")
+
+
+@pytest.mark.parametrize("ent_coef", [0, 1, 0.0])
+def test_whole_entropy_coefficients(small, ent_coef):
+    assert small(REDQ, ent_coef=ent_coef).learn(40)._n_updates == 20
+
+
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_the_buffers_horizon_and_discount_are_the_models(make, algorithm, tmp_path, n_steps):
+    model = make(n_steps=n_steps, gamma=0.9, replay_buffer_class=FadingReplayBuffer)
+    assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (n_steps, 0.9)
+    assert model.replay_buffer_kwargs == {}  # as given
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env=model.env, n_steps=2, gamma=0.8)
+    assert (loaded.replay_buffer.n_steps, loaded.replay_buffer.gamma) == (2, 0.8)
+    make(n_steps=n_steps, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=dict(n_steps=n_steps))
+    for name, value, own in (("n_steps", 5, n_steps), ("gamma", 0.5, 0.99)):
+        with pytest.raises(ValueError, match=f"replay_buffer_kwargs has {name}={value}: expected that of the model, {own}"):
+            make(n_steps=n_steps, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs={name: value})
+
+
+@pytest.mark.parametrize("name", ["layer_norm", "activation_fn"])
+@pytest.mark.parametrize("value", [[], dict(qf=True)], ids=["empty", "one network"])
+def test_layers_of_symphony(small, name, value):
+    with pytest.raises(ValueError, match=rf"{name}=.*expected (at least one entry|one for both, or a dict with keys)"):
+        small(Symphony, policy_kwargs={name: value})
+
+
+def test_another_implementation_of_adam(make):
+    model = make(policy_kwargs=dict(optimizer_kwargs=dict(foreach=True)))
+    assert model.critic.optimizer.defaults["foreach"] and not model.critic.optimizer.defaults["fused"]
+
+
+def test_a_number_of_single_precision(make):
+    make(tau=np.float32(0.25))

@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import nn
 
-from sb3_symphony import Symphony
+from sb3_symphony import REDQ, DroQ, Symphony
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
 
@@ -90,3 +90,29 @@ def test_batch_normalisation(small, share):
     own, averaged = (dict(actor.named_buffers()) for actor in (model.actor, model.policy.averaged_actor))
     assert own["features_extractor.norm.num_batches_tracked"] > 0
     assert all(th.equal(averaged[name], value) for name, value in own.items())
+    model.predict(OBSERVATIONS[0], deterministic=True)  # with statistics of the training, not of this one observation
+
+
+def test_deterministic_is_deterministic(make):
+    """Also where a features extractor drops units in training."""
+
+    class Dropped(FlattenExtractor):
+        def forward(self, observations: th.Tensor) -> th.Tensor:
+            return th.nn.functional.dropout(super().forward(observations), 0.5, self.training)
+
+    model = make(policy_kwargs=dict(actor_averaging=0.3, features_extractor_class=Dropped)).learn(60)
+    actions = [model.predict(OBSERVATIONS, deterministic=True)[0] for _ in range(4)]
+    assert all(np.array_equal(actions[0], each) for each in actions)
+
+
+@pytest.mark.parametrize("cls", [REDQ, DroQ])
+def test_state_dependent_exploration(small, cls, tmp_path):
+    plain, averaged = (
+        small(cls, use_sde=True, policy_kwargs=dict(log_std_init=-1, actor_averaging=part)).learn(80) for part in (0, 0.3)
+    )
+    theirs = averaged.policy.state_dict()
+    assert all(th.equal(value, theirs[name]) for name, value in plain.policy.state_dict().items())
+    averaged.save(tmp_path / "model")
+    first, second = (model.predict(OBSERVATIONS, deterministic=True)[0] for model in (averaged, cls.load(tmp_path / "model")))
+    np.testing.assert_array_equal(first, second)
+    assert not np.array_equal(first, plain.predict(OBSERVATIONS, deterministic=True)[0])

@@ -244,6 +244,14 @@ def test_an_ended_trajectory_is_followed_by_first_steps():
     assert set(buffer.sample(200).observations[:, 0].tolist()) == {0, 1}  # 0 is of the second: the oldest is never drawn
 
 
+@pytest.mark.parametrize("buffer_class", [FadingReplayBuffer, PrioritizedReplayBuffer])
+def test_an_ended_trajectory_of_single_steps_needs_no_mark(buffer_class):
+    buffer = buffer_class(100, OBS, ACT, handle_timeout_termination=False)
+    fill(buffer, 10)
+    end_trajectory(buffer)
+    assert not buffer.dones.any()
+
+
 @pytest.mark.parametrize("done, timeout", [(0, 0), (1, 0), (1, 1)])
 def test_an_ended_trajectory_stays_terminated_if_it_was(done, timeout):
     buffer = NStepReplayBuffer(20, OBS, ACT, n_steps=3, gamma=0.5)

@@ -7,7 +7,7 @@ import gymnasium as gym
 import pytest
 from resume_helpers import GlobalRandomEnv, assert_same_results, difference
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.monitor import Monitor
@@ -206,7 +206,35 @@ def test_fresh_episodes_are_marked_in_the_replay(tmp_path, capsys, n_steps, opti
 
 def test_state_of_callbacks(tmp_path, small, pendulum):
     stop = learn(small(REDQ, pendulum()), tmp_path, 70)
-    state = newest_checkpoint(tmp_path / "checkpoints").state["callbacks"]["StopAt"]
+    state = newest_checkpoint(tmp_path / "checkpoints").state["callbacks"]["StopAt 0"]
     assert state["n_calls"] == 70 and state["evaluations_timesteps"] == [20, 40, 60]
     assert state["best_mean_reward"] == stop.best_mean_reward
     assert not state.keys() & {"eval_freq", "log_path", "verbose", "model", "eval_env"}  # settings, and what is no value
+
+
+class Every(BaseCallback):
+    """Notes every n-th step."""
+
+    def __init__(self, n):
+        super().__init__()
+        self.n = n
+        self.seen = []
+
+    def _on_step(self):
+        if self.num_timesteps % self.n == 0:
+            self.seen.append(self.num_timesteps)
+        return True
+
+
+def test_two_callbacks_of_a_class(tmp_path, small, pendulum):
+    model = small(REDQ, pendulum())
+    record_episodes(model.env)
+    model.learn(
+        60, callback=[first := Every(10), second := Every(25), ExactCheckpoints(tmp_path, 30, callbacks=[first, second])]
+    )
+    model = small(REDQ, pendulum())
+    record_episodes(model.env)
+    again = [Every(10), Every(25)]
+    exact = ExactCheckpoints(tmp_path, 30, callbacks=again, checkpoint=newest_checkpoint(tmp_path))
+    model.learn(100, callback=[*again, exact])
+    assert [each.seen for each in again] == [list(range(10, 101, 10)), [25, 50, 75, 100]]

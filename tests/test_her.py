@@ -68,6 +68,17 @@ def test_save_and_load(make_her, algorithm, tmp_path, n_envs):
     assert model.predict(observation, deterministic=True)[0].shape == (4,)
 
 
+def test_real_goals_are_in_every_batch(make_her):
+    """SB3 samples real goals first, then relabelled ones: one sample cut into batches would sort them apart."""
+    model = make_her(policy_delay=4).learn(200)
+    shares = []
+    for _, batches in model._segments(40, 64):
+        # The real goal is all ones; with two relabelled goals for each, a third is real at least
+        shares += [batch.observations["desired_goal"].eq(1).all(dim=1).float().mean().item() for batch in batches]
+    assert len(shares) == 40
+    assert min(shares) > 0.2 and max(shares) < 0.8
+
+
 def test_without_her(make_her, algorithm):
     """A goal environment is an ordinary Dict environment, too."""
     model = make_her(replay_buffer_class=None)

@@ -110,3 +110,8 @@ def test_refuses_other_noise():
     for other in (model, TD3("MlpPolicy", Returns(), device="cpu"), PPO("MlpPolicy", Returns(), device="cpu")):
         with pytest.raises(TypeError, match="expected a StickyActionNoise"):
             other.learn(3, callback=QuietOnReturn((0, 1)))
+
+
+def test_more_episodes_than_are_kept():
+    with pytest.raises(ValueError, match="n_episodes=5: expected at most the model's stats_window_size, 3"):
+        td3(Returns(), stats_window_size=3).learn(10, callback=QuietOnReturn((50, 250)))

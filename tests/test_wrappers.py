@@ -45,6 +45,17 @@ class Scripted(gym.Env):
         return self.observations[self.step_count], reward, self.step_count == len(self.rewards), False, {}
 
 
+class OneDictionary(Scripted):
+    """Returns the same dictionary at every step."""
+
+    def reset(self, *, seed=None, options=None):
+        self.info = {}
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        return *super().step(action)[:4], self.info
+
+
 def play(env, max_steps=1000):
     """Rewards, last flags and infos of one episode."""
     env.reset()
@@ -334,3 +345,13 @@ def test_leg_mass():
     for factor in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="factor"):
             LegMass(walker(), factor)
+
+
+def test_raw_reward_of_an_environment_that_keeps_its_dictionary():
+    env = UnseenGoal(RewardScale(OneDictionary([1.0, 2.0, -100.0]), 0.5))
+    env.reset()
+    seen = []
+    for _ in range(3):
+        *_, terminated, truncated, info = env.step([0])
+        seen.append((info["raw_reward"], terminated, truncated))
+    assert seen == [(1.0, False, False), (2.0, False, False), (-100.0, True, False)]

@@ -14,9 +14,9 @@ class AveragedActor(BasePolicy):
     the actor's weights over the last part of its updates, which walks more evenly than each of them. The part grows with the
     training. Training never asks it: with or without, the trained actor and the critics are the same.
 
-    Source: polynomial-decay averaging, Shamir & Zhang (2013), "Stochastic Gradient Descent for Non-smooth Optimization", with
-    η = 1 / part - 1; for policies, Nikishin et al. (2018), "Improving Stability in Deep Reinforcement Learning with Weight
-    Averaging".
+    The t-th actor enters with weight 1 / (part · t), at most 1: for large t the polynomial-decay averaging of Shamir & Zhang
+    (2013), "Stochastic Gradient Descent for Non-smooth Optimization", with η = 1 / part - 1. For policies: Nikishin et al.
+    (2018), "Improving Stability in Deep Reinforcement Learning with Weight Averaging".
     """
 
     actor: Any
@@ -32,7 +32,10 @@ class AveragedActor(BasePolicy):
         self.actor_averaging = actor_averaging
         self.averaged_actor = None
         if actor_averaging > 0:
-            self.averaged_actor = copy.deepcopy(self.actor).requires_grad_(False)
+            distribution = getattr(self.actor, "action_dist", None)
+            # gSDE's holds noise matrices with a graph, which cannot be copied; the average needs none
+            self.averaged_actor = copy.deepcopy(self.actor, {id(distribution): copy.copy(distribution)}).requires_grad_(False)
+            self.averaged_actor.set_training_mode(False)  # for good: it only predicts
             del self.averaged_actor.optimizer
             self.register_buffer("n_averaged", th.zeros((), dtype=th.long, device=self.device))
 

@@ -390,7 +390,7 @@ def end_trajectory(buffer: ReplayBuffer) -> None:
         return
     if isinstance(buffer, HerReplayBuffer):
         buffer.truncate_last_trajectory()
-    elif isinstance(buffer, NStepReplayBuffer) or buffer.optimize_memory_usage:
+    elif getattr(buffer, "n_steps", 1) > 1 or buffer.optimize_memory_usage:
         # Others need no mark: they bootstrap from the next observation that they stored
         last = buffer.pos - 1
         if buffer.handle_timeout_termination:

@@ -288,7 +288,8 @@ class QuietOnReturn(BaseCallback):
     :param n_episodes: how many episodes are recent; before there are as many, noise is left as it is
     :param verbose: see SB3
     :raises TypeError: at the start of training, if the model's action noise is no ``StickyActionNoise``
-    :raises ValueError: if a number is out of range or returns do not rise
+    :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
+        episodes (``stats_window_size``)
     """
 
     def __init__(
@@ -303,7 +304,7 @@ class QuietOnReturn(BaseCallback):
         check_pair("independent", independent, "before, after", 0)
         if not returns[0] < returns[1]:
             raise ValueError(f"returns={returns!r}: expected the smaller number first")
-        check_number("n_episodes", n_episodes, 1, 100, integer=True)  # SB3 keeps 100 by default
+        check_number("n_episodes", n_episodes, 1, integer=True)
         self.returns = returns
         self.independent = independent
         self.n_episodes = n_episodes
@@ -318,6 +319,9 @@ class QuietOnReturn(BaseCallback):
 
     def _init_callback(self) -> None:
         self._noises()
+        kept = self.model._stats_window_size
+        if self.n_episodes > kept:
+            raise ValueError(f"n_episodes={self.n_episodes!r}: expected at most the model's stats_window_size, {kept}")
 
     def _on_step(self) -> bool:
         episodes = self.model.ep_info_buffer

@@ -17,8 +17,8 @@ import platform
 import random
 import re
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -305,7 +305,7 @@ class ExactCheckpoints(BaseCallback):
             state["rollout follows"] = rollout_follows
             log_folder = model.logger.get_dir()
             state["log folder"] = None if log_folder is None else os.path.abspath(log_folder)
-            state["callbacks"] = {type(callback).__name__: _attributes(callback) for callback in self.callbacks}
+            state["callbacks"] = {key: _attributes(callback) for key, callback in self._named_callbacks()}
             state["files"] = {path.name: path.read_bytes() for path in self.files()}
             state["episodes"] = model.env.env_method("recorded_state") if is_recorded(model.env) else []
             state["segments"] = []
@@ -323,6 +323,14 @@ class ExactCheckpoints(BaseCallback):
         self._segments_of[steps] = {segment.file for segment in state["segments"]}
         self._tidy(steps)
         return True
+
+    def _named_callbacks(self) -> Iterator[tuple[str, BaseCallback]]:
+        """Each callback with its class's name, and its number among those of its class."""
+        seen: Counter[str] = Counter()
+        for callback in self.callbacks:
+            name = type(callback).__name__
+            yield f"{name} {seen[name]}", callback
+            seen[name] += 1
 
     def _tidy(self, newest: int) -> None:
         """Delete checkpoints beyond ``keep``, those of a future that was given up, and what belongs to none."""
@@ -348,8 +356,8 @@ class ExactCheckpoints(BaseCallback):
         exact = len(episodes) == model.n_envs and all(each_copy(model.env, "replay", episodes))
         if self._buffer is not None:
             restore_buffer(self._buffer, state["buffer"], self.segments)
-        for callback in self.callbacks:
-            vars(callback).update(state["callbacks"].get(type(callback).__name__, {}))
+        for key, callback in self._named_callbacks():
+            vars(callback).update(state["callbacks"].get(key, {}))
         restore_training_state(model, state)
 
         if not exact:

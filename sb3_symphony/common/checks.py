@@ -5,6 +5,8 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 
 def check_number(
     name: str, value: Any, low: float = -math.inf, high: float = math.inf, integer: bool = False, exclusive: bool = False
@@ -26,7 +28,7 @@ def check_number(
     bounds += f"{' and' if bounds else ''} <= {high:g}" if high < math.inf else ""
     message = f"{name}={value!r}: expected {kind}{bounds}"
     number = int(value) if hasattr(value, "__index__") else value
-    if isinstance(value, bool) or not isinstance(number, int if integer else (int, float)):
+    if isinstance(value, bool) or not isinstance(number, int if integer else (int, float, np.floating)):
         raise TypeError(message)
     if not math.isfinite(number) or not low <= number <= high or (exclusive and number == low):
         raise ValueError(message)

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Iterator
+from types import NoneType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer, end_trajectory
 from sb3_symphony.common.checks import check_choice, check_number
@@ -21,7 +23,6 @@ from sb3_symphony.common.noise import DecayingActionNoise
 from sb3_symphony.common.regression import make_regression
 
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
-N_STEP_BUFFERS = (NStepReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer)
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
@@ -77,9 +78,9 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.critic_loss = critic_loss
         self.critic_reduction = critic_reduction
         self._timesteps_at_update = 0
-        self._check_arguments()
 
     def _check_arguments(self) -> None:
+        """Of a new model, and of a loaded one, whose arguments may have been replaced."""
         if not callable(self.learning_rate):
             check_number("learning_rate", self.learning_rate, 0)
         check_number("buffer_size", self.buffer_size, 1, integer=True)
@@ -99,29 +100,38 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         check_choice("target_mode", self.target_mode, TARGET_MODES)
         check_choice("critic_loss", self.critic_loss, CRITIC_LOSSES)
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
+        if self.n_critics != self.policy_kwargs["n_critics"]:
+            raise ValueError(f"n_critics={self.n_critics!r}: the saved model has {self.policy_kwargs['n_critics']!r}")
+        if not isinstance(self.action_noise, (ActionNoise, NoneType)):
+            raise TypeError(f"action_noise={self.action_noise!r}: expected an ActionNoise or None")
         if self.optimize_memory_usage and self.n_steps > 1:
             raise ValueError("optimize_memory_usage=True: n-step returns need n_steps=1 then")
 
     # ---------------------------------------------------------------- set-up
 
     def _setup_model(self) -> None:
-        n_steps, chosen = self.n_steps, self.replay_buffer_class
+        self._check_arguments()
+        n_steps, chosen, given = self.n_steps, self.replay_buffer_class, self.replay_buffer_kwargs
         if isinstance(self.observation_space, spaces.Dict) and n_steps > 1:
             raise ValueError(f"n_steps={n_steps}: expected 1 for Dict observations, as in SB3")
         if chosen is None:
             for_dict, for_n_steps, otherwise = self.default_buffers
             is_dict = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = chosen = for_dict if is_dict else for_n_steps if n_steps > 1 else otherwise
-        if "fade_factor" in self.replay_buffer_kwargs and not issubclass(chosen, FADING_BUFFERS):
-            raise ValueError(f"fade_factor={self.replay_buffer_kwargs['fade_factor']!r}: {chosen.__name__} does not fade")
-        if n_steps > 1:
-            if not issubclass(chosen, N_STEP_BUFFERS):
-                raise ValueError(f"n_steps={n_steps}: {chosen.__name__} has no n-step returns, expected n_steps=1")
-            self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": n_steps, "gamma": self.gamma}
+        if "fade_factor" in given and not issubclass(chosen, FADING_BUFFERS):
+            raise ValueError(f"fade_factor={given['fade_factor']!r}: {chosen.__name__} does not fade")
+        if issubclass(chosen, NStepReplayBuffer):
+            own = {"n_steps": n_steps, "gamma": self.gamma}
+            for name, value in own.items():
+                if given.get(name, value) != value:
+                    raise ValueError(f"replay_buffer_kwargs has {name}={given[name]!r}: expected that of the model, {value!r}")
+            self.replay_buffer_kwargs = {**given, **own}
+        elif n_steps > 1:
+            raise ValueError(f"n_steps={n_steps}: {chosen.__name__} has no n-step returns, expected n_steps=1")
         # SB3 takes a given class for one without n-step returns, and warns: the buffer has its horizon already
         self.n_steps = 1
         super()._setup_model()
-        self.n_steps = n_steps
+        self.n_steps, self.replay_buffer_kwargs = n_steps, given
         self._create_aliases()
         self._regression = make_regression(
             self.critic, self.critic_target, self.critic_loss, self.critic_reduction, self.policy.critic_engine
@@ -168,6 +178,8 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         row_bytes = 8 * get_flattened_obs_dim(self.observation_space)  # two observations in single precision
         updates_per_draw = max(1, MAX_SAMPLE_BYTES // (row_bytes * batch_size))
+        if isinstance(self.replay_buffer, HerReplayBuffer):
+            updates_per_draw = 1  # its samples are sorted, those with their real goal first: not to be cut
         while gradient_steps > 0:
             draw = min(gradient_steps, updates_per_draw)
             samples = self.replay_buffer.sample(draw * batch_size, env=self._vec_normalize_env, **sample_kwargs)

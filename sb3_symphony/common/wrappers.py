@@ -103,6 +103,7 @@ class LearningReward(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         if _find_wrapper(env, Monitor) is None:
             env = Monitor(env)
+        self._innermost = _find_wrapper(env, LearningReward) is None
         super().__init__(env)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -111,7 +112,8 @@ class LearningReward(gym.Wrapper):
         :return: observation, reward for learning, terminated, truncated, info
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
-        info.setdefault("raw_reward", float(reward))  # the innermost of these wrappers has set it first
+        if self._innermost:
+            info["raw_reward"] = float(reward)
         return observation, self.learning_reward(observation, float(reward)), terminated, truncated, info
 
     @abstractmethod

@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_symphony.common.averaging import AveragedActor
 from sb3_symphony.common.checks import check_choice, check_number
-from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults, check_net_arch
+from sb3_symphony.common.ensembles import EnsembleCritic, check_net_arch, with_adam_defaults
 from sb3_symphony.common.regression import ENGINES
 
 
@@ -97,7 +97,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
-            {**adam_defaults(optimizer_class), **(optimizer_kwargs or {})},
+            with_adam_defaults(optimizer_class, optimizer_kwargs),
             n_critics,
             share_features_extractor,
         )

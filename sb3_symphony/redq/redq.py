@@ -148,19 +148,22 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             sde_sample_freq=sde_sample_freq,
             use_sde_at_warmup=use_sde_at_warmup,
         )
-        check_number("batch_size", batch_size, 1, integer=True)
         self.subset_size = subset_size
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
         self.log_ent_coef: th.Tensor | None = None
         self.ent_coef_optimizer: th.optim.Adam | None = None
-        if subset_size != "all":
-            check_number("subset_size", subset_size, 1)
-            if float(subset_size) > self.n_critics:
-                raise ValueError(f"subset_size={subset_size!r}: expected at most n_critics={self.n_critics}")
 
         if _init_setup_model:
             self._setup_model()
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_number("batch_size", self.batch_size, 1, integer=True)
+        if self.subset_size != "all":
+            check_number("subset_size", self.subset_size, 1)
+            if float(self.subset_size) > self.n_critics:
+                raise ValueError(f"subset_size={self.subset_size!r}: expected at most n_critics={self.n_critics}")
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -181,7 +184,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             self.log_ent_coef = th.full((1,), np.log(initial), device=self.device, dtype=th.float32).requires_grad_()
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1), fused=True)
         else:
-            self.ent_coef_tensor = th.tensor(initial, device=self.device)
+            self.ent_coef_tensor = th.tensor(float(initial), device=self.device)
 
     def _resolve_target_entropy(self) -> float:
         if self.target_entropy == "mbpo" and self.env is not None:

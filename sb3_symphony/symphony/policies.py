@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_symphony.common.averaging import AveragedActor
 from sb3_symphony.common.checks import check_choice, check_number
-from sb3_symphony.common.ensembles import EnsembleCritic, adam_defaults, hidden_layers, mlp
+from sb3_symphony.common.ensembles import EnsembleCritic, hidden_layers, mlp, with_adam_defaults
 from sb3_symphony.common.layers import LeakySine
 from sb3_symphony.common.regression import ENGINES
 
@@ -141,7 +141,7 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
             features_extractor_kwargs,
             normalize_images,
             optimizer_class,
-            {**adam_defaults(optimizer_class), **(optimizer_kwargs or {})},
+            with_adam_defaults(optimizer_class, optimizer_kwargs),
             n_critics,
             share_features_extractor,
         )
@@ -166,7 +166,10 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
         self.critic_target.set_training_mode(False)
 
     def _network_kwargs(self, part: str) -> dict[str, Any]:
-        options = dict(activation_fn=self.activation_fn, layer_norm=self.layer_norm)
+        options: dict[str, Any] = dict(activation_fn=self.activation_fn, layer_norm=self.layer_norm)
+        for name, value in options.items():
+            if isinstance(value, dict) and value.keys() != {"pi", "qf"}:
+                raise ValueError(f"{name}={value!r}: expected one for both, or a dict with keys 'pi' and 'qf'")
         chosen = {name: value[part] if isinstance(value, dict) else value for name, value in options.items()}
         return {**chosen, "leaky_slope": self.leaky_slope}
 

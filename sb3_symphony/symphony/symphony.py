@@ -166,35 +166,35 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self.initial_gradient_steps = initial_gradient_steps
         self.episode_gradient_steps = episode_gradient_steps
         self.warmup_policy = warmup_policy
-
-        if critic_learning_rate is not None and not callable(critic_learning_rate):
-            check_number("critic_learning_rate", critic_learning_rate, 0)
-        if len(_pair(min_mix)) != 2:
-            raise ValueError(f"min_mix={min_mix!r}: expected a number, or two (target, actor)")
-        for weight in _pair(min_mix):
-            check_moving("min_mix", weight, 0, 1)
-        self._set_mixes()
-        check_number("target_policy_noise", target_policy_noise, 0)
-        check_number("saturation_penalty", saturation_penalty, 0)
-        check_choice("actor_loss", actor_loss, ACTOR_LOSSES)
-        check_pair("initial_gradient_steps", initial_gradient_steps, "uniform, faded", 0, integer=True)
-        check_number("episode_gradient_steps", episode_gradient_steps, 0, integer=True)
-        check_choice("warmup_policy", warmup_policy, ("actor", "uniform"))
-        if isinstance(action_noise, str):
-            check_choice("action_noise", action_noise, ("default",))
-
         self._redraw_actor = True  # an episode begins
         self._new_episodes = 0  # begun since the last update
 
         if _init_setup_model:
             self._setup_model()
 
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        if self.critic_learning_rate is not None and not callable(self.critic_learning_rate):
+            check_number("critic_learning_rate", self.critic_learning_rate, 0)
+        if len(_pair(self.min_mix)) != 2:
+            raise ValueError(f"min_mix={self.min_mix!r}: expected a number, or two (target, actor)")
+        for weight in _pair(self.min_mix):
+            check_moving("min_mix", weight, 0, 1)
+        check_number("target_policy_noise", self.target_policy_noise, 0)
+        check_number("saturation_penalty", self.saturation_penalty, 0)
+        check_choice("actor_loss", self.actor_loss, ACTOR_LOSSES)
+        check_pair("initial_gradient_steps", self.initial_gradient_steps, "uniform, faded", 0, integer=True)
+        check_number("episode_gradient_steps", self.episode_gradient_steps, 0, integer=True)
+        check_choice("warmup_policy", self.warmup_policy, ("actor", "uniform"))
+
     def _setup_model(self) -> None:
+        if isinstance(self.action_noise, str):
+            check_choice("action_noise", self.action_noise, ("default",))
+            self.action_noise = DecayingNormalActionNoise(self.action_space.shape)
         super()._setup_model()
+        self._set_mixes()
         rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
         self.critic_lr_schedule = FloatSchedule(rate)
-        if isinstance(self.action_noise, str):
-            self.action_noise = DecayingNormalActionNoise(self.action_space.shape)
         # Mean value at the previous update, which the actor's loss compares with
         self.baseline = th.zeros((), device=self.device)
 
