@@ -537,6 +537,8 @@ def _bench(arguments: dict[str, Any], argv: Sequence[str]) -> int:
 
     result = bench(validated(BenchOptions, arguments))
     print(result.summary())
+    for name, reason in result.failed:
+        print(f"failed: {name}: {reason} (see {result.folder / name}.log)", file=sys.stderr)
     return 130 if result.interrupted else int(bool(result.failed))
 
 
@@ -599,7 +601,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.unknown(unknown[0])
     try:
         if not arguments.pop("silent", False):
-            return run(arguments, argv)
+            code = run(arguments, argv)
+            sys.stdout.flush()
+            return code
         if parser.takes("--progress"):
             arguments["progress"] = False
         wanted = arguments.get("json_file") == "-"
@@ -610,3 +614,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:  # of `sb3-symphony … | head`: nobody reads any more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python tells it again when it ends
+        return 141  # as a shell reports SIGPIPE

@@ -134,6 +134,10 @@ def test_flags_reach_the_options(monkeypatch):
         ("--env BipedalWaker-v3", "unknown environment 'BipedalWaker-v3': did you mean 'BipedalWalker-v3'?"),
         ("--env Pendulum-v77", "did you mean 'Pendulum-v1'?"),
         ("--env nowhere:Pendulum-v1", "nowhere"),
+        ("--algo sac --env Pendulum", "unknown environment 'Pendulum': did you mean 'Pendulum-v1'?"),
+        ("--log-interval 0", "log_interval: 0 — expected a whole number"),
+        ("--eval-freq -5", "eval_freq: -5 — expected a number >= -1"),
+        ("--num-threads 100000", "num_threads: 100000 — expected a number <= 1024"),
         ("--algo symphny", "unknown algorithm 'symphny': did you mean 'symphony'?"),
         ("--algo zzz", "expected one of symphony, redq, droq"),
         ("--algo sac --env CartPole-v1", "its action space is Discrete(2) — sac needs a continuous one (Box)"),
@@ -169,6 +173,13 @@ def test_mistakes(capsys, folder, arguments, message):
     line = fails(capsys, "train", *(argument.replace(":~", ": ") for argument in argv))
     assert message in line
     assert not list(folder.iterdir())  # nothing was made
+
+
+def test_nobody_reads_on():
+    """``sb3-symphony list | head``"""
+    process = subprocess.Popen([sys.executable, "-m", "sb3_symphony", "list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait() == 141
 
 
 def test_unknown_command(capsys):

@@ -255,6 +255,20 @@ def test_interrupted_and_killed(whole, folder):
     assert_same_grid(results, whole)
 
 
+def test_killed_alone(whole, folder):
+    """``kill -9`` of the command itself: its workers live on, and make way for those of the same command at once."""
+    results = folder / "results"
+    process = start(whole.parent / "study.yml", results)
+    wait_for(lambda: half_done(results), process)
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    again = start(whole.parent / "study.yml", results)
+    out = again.communicate()[0]
+    assert again.returncode == 0 and "failed" not in out, out
+    assert_same_grid(results, whole)
+
+
 def test_a_failed_cell_stops_nothing(folder, monkeypatch, capsys):
     (folder / "crash.py").write_text(CRASH)
     monkeypatch.setenv("PYTHONPATH", str(folder))
@@ -262,9 +276,9 @@ def test_a_failed_cell_stops_nothing(folder, monkeypatch, capsys):
     environments = [{"id": "crash:Raise-v0"}, {"id": "crash:Die-v0"}, "Pendulum-v1"]
     study = write_study(folder, environments=environments, algorithms=STUDY["algorithms"][:1], seeds=1, steps=210)
     assert main(["bench", str(study), "-j", "1", "-f", "results"]) == 1
-    out = capsys.readouterr().out
-    assert "failed: td3/Raise-v0_0: RuntimeError: the motor is hot (see" in out
-    assert "failed: td3/Die-v0_0: its process was ended by SIGKILL (out of memory?)" in out
+    out, err = capsys.readouterr()
+    assert "failed: td3/Raise-v0_0: RuntimeError: the motor is hot (see" in err
+    assert "failed: td3/Die-v0_0: its process was ended by SIGKILL (out of memory?)" in err
     assert "- not done, and not in these numbers: td3 0" in out
     assert done(folder / "results") == ["td3/Pendulum-v1_0"]
     assert "Traceback" in (folder / "results" / "td3" / "Raise-v0_0.log").read_text()
@@ -505,3 +519,22 @@ def test_an_address_where_nobody_answers(folder, capsys):
     assert "'ray://127.0.0.1:1' — Connection refused" in fails(capsys, *ray, "ray://127.0.0.1:1")
     assert "'nonsense' — expected auto, HOST:PORT or ray://HOST:PORT" in fails(capsys, *ray, "nonsense")
     assert [path.name for path in folder.iterdir()] == ["study.yml"]
+
+
+def test_results_are_not_collected_into_themselves(whole, folder, capsys):
+    shutil.copytree(whole, folder / "copy")
+    (folder / "link").symlink_to(folder / "copy")
+    study, runs = str(whole.parent / "study.yml"), [folder / "copy" / name for name in CELLS]
+    before = contents(*runs)
+    for name in ("copy", "link", "link/../copy"):
+        message = fails(capsys, "bench", study, "-f", "copy", "--report", "--collect", name)
+        assert "expected another folder than that of the results" in message
+    assert contents(*runs) == before
+    assert "collect: ''" in fails(capsys, "bench", study, "-f", "copy", "--report", "--collect", "")
+
+
+def test_a_result_that_is_none(whole, folder, capsys):
+    shutil.copytree(whole, folder / "copy")
+    (folder / "copy" / "td3" / "Pendulum-v1_0" / "result.json").write_text("{}")
+    assert main(["bench", str(whole.parent / "study.yml"), "-f", "copy", "--dry-run"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "1 queued, 5 done"

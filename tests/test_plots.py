@@ -1,6 +1,7 @@
 """Figures: what is drawn equals what the files say."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -292,10 +293,23 @@ def test_mistakes(logs, capsys, arguments, message):
     assert sorted(logs.parent.rglob("*")) == before
 
 
-def test_a_damaged_file(logs, capsys):
-    (logs / "sac" / "X-v0_2" / "evaluations.npz").write_bytes(b"broken")
+@pytest.mark.parametrize("content", [b"broken", b""])
+def test_a_damaged_file(logs, capsys, content):
+    (logs / "sac" / "X-v0_2" / "evaluations.npz").write_bytes(content)
     assert main(["plot", "--evaluations", "-e", "X-v0"]) == 2
     assert "evaluations.npz: not evaluations of Stable-Baselines3, or damaged" in capsys.readouterr().err
+
+
+def test_logs_that_are_empty_or_gone(logs, capsys):
+    shutil.rmtree(logs / "tb" / "sac_1")
+    shutil.rmtree(logs / "tb" / "sac_2")
+    (logs / "tb" / "sac_2").mkdir()
+    assert main(["plot", "-a", "sac", "-e", "X-v0", "--scalars", "-o", "s.png"]) == 0
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == f"left out: logs/sac/X-v0_1: its TensorBoard log '{logs}/tb/sac_1' is gone"
+    assert told[1:] == ["left out: logs/sac/X-v0_2: nothing is logged yet"]
+    assert main(["plot", "logs/sac/X-v0_2", "--scalars", "-o", "s.png"]) == 2
+    assert "logs/sac/X-v0_2: nothing is logged yet" in capsys.readouterr().err
 
 
 def test_a_run_without_evaluations_is_told(logs, capsys, figures):

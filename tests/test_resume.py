@@ -242,6 +242,16 @@ def test_tensorboard_goes_on_in_its_folder(killed, folder):
     assert [step for step, _ in scalars("tb_b")["rollout/ep_len_mean"]] == [200, 400]
 
 
+def test_tensorboard_goes_on_where_the_run_is_moved_to(killed, folder):
+    log = "b/td3/Pendulum-v1_1/log"
+    run = killed(415, options(log_folder="b", tensorboard_log=log, n_timesteps=450, save_freq=150, eval_freq=60))
+    (folder / "b").rename("c")
+    resume(folder / "c" / run.relative_to("b"))
+    assert not (folder / "b").exists()
+    events = EventAccumulator(str(folder / "c/td3/Pendulum-v1_1/log/Pendulum-v1/TD3_1")).Reload()
+    assert [event.step for event in events.Scalars("eval/mean_reward")] == [60, 120, 180, 240, 300, 360, 420]
+
+
 @pytest.mark.parametrize("log_interval", [1, 3])
 def test_on_policy_iterations_go_on(killed, logged, log_interval):
     whole = train(options("ppo", log_folder="a", n_timesteps=300, log_interval=log_interval)).run.path
@@ -361,6 +371,29 @@ def test_run_without_checkpoints(monkeypatch, capsys):
     assert train(options(eval_freq=100, save_freq=-1)).interrupted
     assert main(["train", "--resume", "logs/td3/Pendulum-v1_1"]) == 2
     assert "has no checkpoints — it was started without --save-freq" in capsys.readouterr().err
+
+
+def test_folder_of_checkpoints_that_was_deleted(folder, capsys):
+    run = train(options()).run.path
+    shutil.rmtree(run / "checkpoints")
+    assert main(["train", "--resume", str(run), "-n", "300"]) == 2
+    assert "has no checkpoints — they were deleted" in capsys.readouterr().err
+
+
+def test_a_run_whose_command_was_deleted_goes_on(killed):
+    run = killed(230, options())
+    (run / "Pendulum-v1" / "command.txt").unlink()
+    resume(run)
+    assert (run / "Pendulum-v1" / "command.txt").read_text().startswith("sb3-symphony train")
+
+
+def test_options_that_are_not_ours(killed, capsys):
+    run = killed(230, options())
+    file = run / "Pendulum-v1" / "args.yml"
+    file.write_text(file.read_text().replace("seed: 1", f"seed: {2**32}"))
+    capsys.readouterr()
+    assert main(["train", "--resume", str(run)]) == 2
+    assert f"error: {file}: seed: {2**32}" in capsys.readouterr().err
 
 
 def test_checkpoints_that_were_deleted(folder, capsys):

@@ -129,7 +129,7 @@ def read_evaluations(folder: Path) -> Evaluations | None:
         with np.load(path) as data:
             successes = data["successes"].astype(float) if "successes" in data else None
             return Evaluations(data["timesteps"], data["results"], data["ep_lengths"], successes)
-    except (OSError, KeyError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, ValueError, AttributeError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not evaluations of Stable-Baselines3, or damaged — {error}") from None
 
 
@@ -213,8 +213,8 @@ class Run:
 
     @cached_property
     def scalars(self) -> dict[str, Scalar]:
-        """Scalars of the TensorBoard log, see :func:`read_scalars`, or copied out of it; empty if there are none."""
-        if self.log:
+        """Scalars of the TensorBoard log, see :func:`read_scalars`, or copied out of it; empty if there are none (left)."""
+        if self.log and self.log.is_dir():
             return read_scalars(self.log)
         return read_scalar_table(path) if (path := self.path / "scalars.csv").exists() else {}
 

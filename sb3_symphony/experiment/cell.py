@@ -22,6 +22,7 @@ import threading
 import time
 import traceback
 import zipfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -182,6 +183,9 @@ def _obey(control: Control) -> None:
         time.sleep(_POLL)
         if os.getppid() != parent:  # the worker was killed: another one may begin with this cell any moment
             os._exit(1)
+        session = control.path.parent
+        if session.parent.is_dir() and not session.is_dir():  # the grid was killed, and another execution begins
+            os._exit(1)
         said = control.heard()
         if said is not None and said["beat"] != beat:
             beat, heard = said["beat"], time.monotonic()
@@ -209,9 +213,10 @@ def read_result(run: Path) -> dict[str, Any] | None:
     :return: content of its :func:`result_file`; None if there is none
     """
     try:
-        return json.loads(result_file(run).read_text(encoding="utf-8"))
+        result = json.loads(result_file(run).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
+    return result if isinstance(result, dict) and "n_timesteps" in result else None
 
 
 def begun(run: RunFolder) -> bool:
@@ -265,6 +270,7 @@ def run_cell(job: Job) -> bool:
     options = TrainOptions.model_validate(job.options)
     run = RunFolder(Path(job.run), RunFolder.file_name(options.env))
     if begun(run):
+        _wait_for_predecessor(run)
         again = TrainOptions(resume=str(run.path), n_timesteps=options.n_timesteps, save_freq=options.save_freq)
         result = train(again, _command(options))
     else:
@@ -284,6 +290,15 @@ def run_cell(job: Job) -> bool:
     }
     write_atomically(result_file(run.path), (json.dumps(content, indent=1) + "\n").encode())
     return True
+
+
+def _wait_for_predecessor(run: RunFolder) -> None:
+    """A cell of an execution that was killed notices that there is another one, soon or when the file system tells."""
+    from filelock import FileLock, Timeout
+
+    if run.checkpoints.is_dir():
+        with suppress(Timeout), FileLock(run.checkpoints / ".lock", timeout=PATIENCE):
+            pass
 
 
 def _updates(model: Path) -> int:

@@ -182,6 +182,10 @@ def shipped_environments(algo: str) -> list[str]:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
+#: number of threads, -1: PyTorch's choice; PyTorch dies of far too many
+Threads = Annotated[int, Field(ge=-1, le=1024)]
+
+
 class TrainOptions(BaseModel):
     """Options of ``sb3-symphony train``; their meaning is in its ``--help``."""
 
@@ -192,7 +196,7 @@ class TrainOptions(BaseModel):
     n_timesteps: int = Field(default=-1, ge=-1)
     seed: int = Field(default=-1, ge=-1, lt=2**31)
     log_folder: str = "logs"
-    eval_freq: int = 10_000
+    eval_freq: int = Field(default=10_000, ge=-1)
     eval_episodes: int = Field(default=10, ge=1)
     protocol: Literal["standard"] | None = None
     threshold: FiniteFloat | None = None
@@ -210,16 +214,16 @@ class TrainOptions(BaseModel):
     eval_env_kwargs: dict[str, Any] = {}
     n_seeds: int = Field(default=1, ge=1)
     device: str = "auto"
-    num_threads: int = -1
+    num_threads: Threads = -1
     log_interval: int = Field(default=-1, ge=-2)
     verbose: int | None = Field(default=None, ge=0, le=2)
     progress: bool | None = None
     quiet: bool = False
     json_file: str | None = None
 
-    @field_validator("n_timesteps")
+    @field_validator("n_timesteps", "log_interval")
     @classmethod
-    def _some_steps(cls, value: int) -> int:
+    def _not_zero(cls, value: int) -> int:
         if value == 0:
             raise ValueError("expected a whole number greater than 0")
         return value
@@ -333,7 +337,8 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
             first["msg"].removeprefix("Value error, ").partition(", unable to")[0].replace("Input should be", "expected", 1)
         )
         message = message.replace("String should have", "expected")
-        message = message.replace("greater than or equal to", "a number >=").replace("less than", "a number <")
+        for words, sign in (("greater than or equal to", ">="), ("less than or equal to", "<="), ("less than", "<")):
+            message = message.replace(words, f"a number {sign}")
         message = message.replace("a valid integer", "a whole number").replace("a valid ", "a ")
         raise ConfigError(f"{key}: {values.get(key)!r} — {message}") from None
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Literal
+from uuid import uuid4
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
@@ -54,8 +55,8 @@ class BenchOptions(BaseModel):
     address: str | None = None
     algo: list[str] = []
     report: bool = False
-    page: str | None = None
-    collect: str | None = None
+    page: str | None = Field(default=None, min_length=1)
+    collect: str | None = Field(default=None, min_length=1)
     dry_run: bool = False
 
 
@@ -78,11 +79,10 @@ class BenchResult:
     untouched: bool = False
 
     def summary(self) -> str:
-        """:return: table, and failures, for the end of the command"""
+        """:return: table, and where all is, for the end of the command"""
         if self.untouched:
             return self.table
         lines = [self.table]
-        lines += [f"failed: {name}: {reason} (see {self.folder / name}.log)" for name, reason in self.failed]
         if self.interrupted:
             lines.append(f"interrupted, saved in {self.folder} — the same command goes on")
         else:
@@ -236,7 +236,7 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
                     progress = [now[each.cell.name] if each.cell.name in waiting else each for each in progress]
                     _write_settings(progress, folder, path)
                     interrupted = interrupted or _run_ready(study, progress, folder, session, backend)
-                shutil.rmtree(session)
+                shutil.rmtree(session.parent)
         finally:
             backend.close()
     for each in progress:
@@ -290,13 +290,14 @@ def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, p
 
 def _new_session(backend: "Backend", folder: Path, new: bool) -> Path:
     """Folder of this execution, which all machines see."""
-    session = folder / ".session"
-    shutil.rmtree(session, ignore_errors=True)
-    session.mkdir()
+    sessions = folder / ".session"
+    shutil.rmtree(sessions, ignore_errors=True)
+    session = sessions / uuid4().hex  # cells of one that was killed look for theirs, and end
+    session.mkdir(parents=True)
     try:
         backend.check_folder(session)
     except ConfigError:
-        shutil.rmtree(folder if new else session)
+        shutil.rmtree(folder if new else sessions)
         raise
     return session
 

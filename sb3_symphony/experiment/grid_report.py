@@ -35,7 +35,7 @@ def collect(study: Study, progress: Sequence[Progress], folder: Path, target: Pa
     """
     from sb3_symphony.analysis.tables import scalar_table
 
-    if target == folder:
+    if target.resolve() == folder.resolve():
         raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
     found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
     of_models = [f"{name}.*" for name, figure in study.figures.items() if figure.gait_at is not None]

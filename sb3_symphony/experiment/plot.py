@@ -170,6 +170,12 @@ def _curve_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, lis
     return _told(panels, left_out)
 
 
+def _why_no_scalars(run: "Run") -> str:
+    if run.log is None:
+        return "no TensorBoard log is known — `train -tb` writes one; a log's own folder can be given instead"
+    return "nothing is logged yet" if run.log.is_dir() else f"its TensorBoard log '{run.log}' is gone"
+
+
 def _scalar_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, list[Curve]]":
     """A panel for each quantity, a curve for each group that has logged it."""
     from sb3_symphony.analysis.plots import SCALARS, scalar_curve, summarised
@@ -181,12 +187,7 @@ def _scalar_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, li
             raise ConfigError(f"--tags: '{tag}' — no run has logged it{known}")
     several = len({group.env for group in groups}) > 1
     panels: dict[str, list[Curve]] = {}
-    left_out = [
-        f"{run.path}: no TensorBoard log is known — `train -tb` writes one; a log's own folder can be given instead"
-        for group in groups
-        for run in group.runs
-        if run.log is None and not run.scalars
-    ]
+    left_out = [f"{run.path}: {_why_no_scalars(run)}" for group in groups for run in group.runs if not run.scalars]
     for tag in options.tags or [tag for tag in SCALARS if tag in logged] or sorted(logged):
         for group in groups:
             lines = _lines(

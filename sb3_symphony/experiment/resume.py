@@ -55,7 +55,7 @@ class StoredRun:
         try:
             with np.load(path) as data:
                 return bool(data["results"][-1].mean() >= stop_reward and self.steps == data["timesteps"][-1])
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
             return False
 
     def checkpoint(self) -> Checkpoint | None:
@@ -78,7 +78,7 @@ class StoredRun:
 
 
 def _spelling(name: str) -> str:
-    short = {"n_timesteps": "-n", "hyperparams": "-params", "conf_file": "-conf"}
+    short = {"n_timesteps": "-n", "hyperparams": "-params", "conf_file": "-conf", "json_file": "--json"}
     return short.get(name, "--" + name.replace("_", "-"))
 
 
@@ -109,7 +109,10 @@ def open_run(options: TrainOptions) -> StoredRun:
         what = "no run folder (no <env>/args.yml in it)" if folder.is_dir() else "no such folder"
         raise ConfigError(f"--resume: '{folder}' — {what}; expected one such as logs/symphony/BipedalWalker-v3_1")
     run = RunFolder(folder, found[0].parent.name)
-    stored: TrainOptions = validated(TrainOptions, read_yaml(found[0]))
+    try:
+        stored: TrainOptions = validated(TrainOptions, read_yaml(found[0]))
+    except ConfigError as error:
+        raise ConfigError(f"{found[0]}: {str(error).removeprefix(f'{found[0]}: ')}") from None
 
     given = {name: getattr(options, name) for name in options.model_fields_set - {"resume"}}
     for name, value in given.items():
@@ -130,7 +133,8 @@ def open_run(options: TrainOptions) -> StoredRun:
 
     result = StoredRun(run, resumed, config, model_steps(run.model))
     if not result.finished and not run.checkpoints.is_dir():
-        raise ConfigError(f"--resume: '{folder}' has no checkpoints — it was started without --save-freq")
+        why = "they were deleted" if stored.save_freq > 0 else "it was started without --save-freq"
+        raise ConfigError(f"--resume: '{folder}' has no checkpoints — {why}")
     if not result.finished and resumed.save_freq <= 0:
         raise ConfigError(f"--save-freq: {resumed.save_freq} — expected a number > 0 for a run that is resumed")
     return result
@@ -159,16 +163,17 @@ class _TensorBoardOnward(TensorBoardOutputFormat):
         self._is_closed = False
 
 
-def continue_logs(model: BaseAlgorithm, checkpoint: Checkpoint, learn_arguments: dict[str, Any]) -> None:
+def continue_logs(model: BaseAlgorithm, run: RunFolder, checkpoint: Checkpoint, learn_arguments: dict[str, Any]) -> None:
     """
     Let a resumed model log as if it had never stopped.
 
     :param model: model that is about to learn
+    :param run: folder of the run, which may have been moved
     :param checkpoint: where it goes on from
     :param learn_arguments: arguments of its ``learn()``, of which ``log_interval`` may change
     """
     if model.tensorboard_log:
-        folder = checkpoint.state["log folder"]
+        folder = str(run.log or checkpoint.state["log folder"])
         writers: list[KVWriter] = [HumanOutputFormat(sys.stdout)] if model.verbose >= 1 else []
         model.set_logger(Logger(folder, [*writers, _TensorBoardOnward(folder, checkpoint.steps)]))
     if isinstance(model, OnPolicyAlgorithm) and learn_arguments.get("log_interval", 1) is not None:

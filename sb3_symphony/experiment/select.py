@@ -16,6 +16,7 @@ from sb3_symphony.experiment.config import (
     ConfigError,
     NamedList,
     RunSettings,
+    Threads,
     TrainOptions,
     check_algorithm,
     read_yaml,
@@ -63,7 +64,7 @@ class SelectOptions(BaseModel):
     env_wrapper: NamedList = []
     gym_packages: list[str] = []
     device: str = "auto"
-    num_threads: int = -1
+    num_threads: Threads = -1
 
 
 @dataclass(frozen=True)
@@ -284,7 +285,7 @@ class EvaluateOptions(SelectOptions):
     action_delay: int = Field(default=0, ge=0)
     json_file: str | None = None
     progress: bool = False
-    num_threads: int = 1  # one observation at a time is fastest so, and results do not depend on the machine's cores
+    num_threads: Threads = 1  # one observation at a time is fastest so, and results do not depend on the machine's cores
 
 
 class EnjoyOptions(SelectOptions):
@@ -326,7 +327,7 @@ class AgentsOptions(SelectOptions):
     n_timesteps: int | None = Field(default=None, ge=1)
     output: str | None = Field(default=None, min_length=1)
     progress: bool = False
-    num_threads: int = 1
+    num_threads: Threads = 1
 
 
 class VideoOptions(AgentsOptions):

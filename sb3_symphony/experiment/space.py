@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from sb3_symphony.common.checks import suggestion
-from sb3_symphony.experiment.config import ConfigError, TrainOptions, read_yaml, shipped_folder
+from sb3_symphony.experiment.config import ConfigError, Threads, TrainOptions, read_yaml, shipped_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class TuneOptions(BaseModel):
     study_name: str | None = Field(default=None, min_length=1, max_length=200)
     heartbeat: int = Field(default=30, ge=1)
     device: str = "auto"
-    num_threads: int = -1
+    num_threads: Threads = -1
     show: bool = False
 
     @field_validator("n_jobs", "n_timesteps")

@@ -358,7 +358,7 @@ def _train(
             command += f" --seed {seed}"  # so that the command repeats this run
     else:
         beginning = f" ({_resuming(checkpoint, model)})"
-        command = f"{run.command}\n{command}"
+        command = f"{run.command}\n{command}".lstrip()
         restore_files(run, checkpoint)
     with full_disk_told(run.path):
         run.write_configuration(used.model_dump(exclude=_NOT_OF_THE_RUN), config.plain, command)
@@ -378,7 +378,7 @@ def _train(
     intervals: dict[int, dict[str, Any]] = {-1: {}, -2: {"log_interval": None}}
     learn_arguments = intervals.get(options.log_interval, {"log_interval": options.log_interval})
     if checkpoint is not None:
-        continue_logs(model, checkpoint, learn_arguments)
+        continue_logs(model, run, checkpoint, learn_arguments)
 
     total = config.settings.n_timesteps
     if not options.quiet:
