@@ -599,16 +599,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     command, run, parser = (arguments.pop(name) for name in ("command", "run", "parser"))
     if unknown:
         parser.unknown(unknown[0])
+    silent = arguments.pop("silent", False)
+    if silent and parser.takes("--progress"):
+        arguments["progress"] = False
+    quiet = silent and arguments.get("json_file") != "-"
     try:
-        if not arguments.pop("silent", False):
+        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere) if quiet else nullcontext():
             code = run(arguments, argv)
-            sys.stdout.flush()
-            return code
-        if parser.takes("--progress"):
-            arguments["progress"] = False
-        wanted = arguments.get("json_file") == "-"
-        with open(os.devnull, "w") as nowhere, nullcontext() if wanted else redirect_stdout(nowhere):
-            return run(arguments, argv)
+        sys.stdout.flush()
+        return code
     except ConfigError as error:
         print(f"sb3-symphony {command}: error: {error}", file=sys.stderr)
         return 2
