@@ -295,7 +295,7 @@ def _new_session(backend: "Backend", folder: Path, new: bool) -> Path:
     session = sessions / uuid4().hex  # cells of one that was killed look for theirs, and end
     session.mkdir(parents=True)
     try:
-        backend.check_folder(session)
+        backend.check_folder(sessions)
     except ConfigError:
         shutil.rmtree(folder if new else sessions)
         raise
