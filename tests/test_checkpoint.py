@@ -206,7 +206,7 @@ def test_fresh_episodes_are_marked_in_the_replay(tmp_path, capsys, n_steps, opti
 
 def test_state_of_callbacks(tmp_path, small, pendulum):
     stop = learn(small(REDQ, pendulum()), tmp_path, 70)
-    state = newest_checkpoint(tmp_path / "checkpoints").state["callbacks"]["StopAt 0"]
+    state = newest_checkpoint(tmp_path / "checkpoints").state["callbacks"]["StopAt"]
     assert state["n_calls"] == 70 and state["evaluations_timesteps"] == [20, 40, 60]
     assert state["best_mean_reward"] == stop.best_mean_reward
     assert not state.keys() & {"eval_freq", "log_path", "verbose", "model", "eval_env"}  # settings, and what is no value

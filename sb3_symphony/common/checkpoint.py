@@ -325,12 +325,12 @@ class ExactCheckpoints(BaseCallback):
         return True
 
     def _named_callbacks(self) -> Iterator[tuple[str, BaseCallback]]:
-        """Each callback with its class's name, and its number among those of its class."""
+        """Each callback with its class's name, numbered from the second one of a class on."""
         seen: Counter[str] = Counter()
         for callback in self.callbacks:
             name = type(callback).__name__
-            yield f"{name} {seen[name]}", callback
             seen[name] += 1
+            yield name if seen[name] == 1 else f"{name} {seen[name]}", callback
 
     def _tidy(self, newest: int) -> None:
         """Delete checkpoints beyond ``keep``, those of a future that was given up, and what belongs to none."""
