@@ -228,6 +228,14 @@ def _plain_mapping(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
+def noted_log(note: Path) -> Path | None:
+    """
+    :param note: file of a run that tells where its TensorBoard log is, relative to the file
+    :return: that folder, which may be gone; None if there is no such file
+    """
+    return Path(os.path.normpath(note.parent / note.read_text(encoding="utf-8").strip())) if note.exists() else None
+
+
 def open_run(folder: Path) -> Run:
     """
     :param folder: run folder, or folder of TensorBoard event files
@@ -242,14 +250,13 @@ def open_run(folder: Path) -> Run:
         raise ValueError(f"{folder}: {what} — expected one such as logs/symphony/BipedalWalker-v3_1")
     details = next((path.parent for path in sorted(folder.glob("*/config.yml"))), folder / name)
     options, config = (_plain_mapping(details / file) for file in ("args.yml", "config.yml"))
-    log = details / "tensorboard.txt"
     return Run(
         folder,
         algo=str(options.get("algo", folder.absolute().parent.name)),
         env=str(options.get("env", details.name)),
         seed=options.get("seed"),
         config=config,
-        log=Path(os.path.normpath(details / log.read_text(encoding="utf-8").strip())) if log.exists() else None,
+        log=noted_log(details / "tensorboard.txt"),
         options=options,
     )
 

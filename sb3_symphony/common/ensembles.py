@@ -79,8 +79,9 @@ def with_adam_defaults(optimizer_class: type[th.optim.Optimizer], kwargs: dict[s
     :param optimizer_class: The optimiser
     :param kwargs: Arguments given, which are left as they are
     """
-    one_pass = optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in (kwargs or {})
-    return {**({"fused": True} if one_pass else {}), **(kwargs or {})}
+    given = kwargs or {}
+    one_pass = optimizer_class in (th.optim.Adam, th.optim.AdamW) and "foreach" not in given
+    return {"fused": True, **given} if one_pass else given
 
 
 def _modules(

@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Iterator
-from types import NoneType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -102,7 +101,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
         if self.n_critics != self.policy_kwargs["n_critics"]:
             raise ValueError(f"n_critics={self.n_critics!r}: the saved model has {self.policy_kwargs['n_critics']!r}")
-        if not isinstance(self.action_noise, (ActionNoise, NoneType)):
+        if self.action_noise is not None and not isinstance(self.action_noise, ActionNoise):
             raise TypeError(f"action_noise={self.action_noise!r}: expected an ActionNoise or None")
         if self.optimize_memory_usage and self.n_steps > 1:
             raise ValueError("optimize_memory_usage=True: n-step returns need n_steps=1 then")

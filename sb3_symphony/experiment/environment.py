@@ -129,7 +129,8 @@ def _wrapped(env: gym.Env, wrappers: Wrappers) -> gym.Env:
         try:
             env = wrapper(env)
         except (ValueError, TypeError, AssertionError) as error:
-            raise ConfigError(f"env_wrapper: {wrapper.func.__name__}: {error}") from None  # type: ignore[attr-defined]
+            named = getattr(wrapper, "func", wrapper)  # a class with arguments, or any function
+            raise ConfigError(f"env_wrapper: {named.__name__}: {error}") from None
     return env
 
 

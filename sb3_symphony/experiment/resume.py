@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from torch.utils.tensorboard import SummaryWriter
 
+from sb3_symphony.analysis.runs import noted_log, read_evaluations
 from sb3_symphony.common.checkpoint import Checkpoint, checkpoint_files, newest_checkpoint
 from sb3_symphony.common.files import DamagedFile, write_atomically
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
@@ -49,14 +49,16 @@ class StoredRun:
     @property
     def _stopped_by_reward(self) -> bool:
         """Whether ``stop_reward`` ended it, and its model is saved."""
-        stop_reward, path = self.config.settings.stop_reward, self.run.path / "evaluations.npz"
-        if stop_reward is None or not path.is_file():
+        stop_reward = self.config.settings.stop_reward
+        if stop_reward is None:
             return False
         try:
-            with np.load(path) as data:
-                return bool(data["results"][-1].mean() >= stop_reward and self.steps == data["timesteps"][-1])
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+            evaluations = read_evaluations(self.run.path)
+        except ValueError:  # damaged
             return False
+        if evaluations is None:
+            return False
+        return bool(evaluations.returns[-1].mean() >= stop_reward and self.steps == evaluations.steps[-1])
 
     def checkpoint(self) -> Checkpoint | None:
         """
@@ -109,10 +111,11 @@ def open_run(options: TrainOptions) -> StoredRun:
         what = "no run folder (no <env>/args.yml in it)" if folder.is_dir() else "no such folder"
         raise ConfigError(f"--resume: '{folder}' — {what}; expected one such as logs/symphony/BipedalWalker-v3_1")
     run = RunFolder(folder, found[0].parent.name)
+    content = read_yaml(found[0])
     try:
-        stored: TrainOptions = validated(TrainOptions, read_yaml(found[0]))
+        stored: TrainOptions = validated(TrainOptions, content)
     except ConfigError as error:
-        raise ConfigError(f"{found[0]}: {str(error).removeprefix(f'{found[0]}: ')}") from None
+        raise ConfigError(f"{found[0]}: {error}") from None
 
     given = {name: getattr(options, name) for name in options.model_fields_set - {"resume"}}
     for name, value in given.items():
@@ -173,7 +176,8 @@ def continue_logs(model: BaseAlgorithm, run: RunFolder, checkpoint: Checkpoint, 
     :param learn_arguments: arguments of its ``learn()``, of which ``log_interval`` may change
     """
     if model.tensorboard_log:
-        folder = str(run.log or checkpoint.state["log folder"])
+        noted = noted_log(run.log_folder)
+        folder = str(noted.absolute()) if noted is not None and noted.is_dir() else checkpoint.state["log folder"]
         writers: list[KVWriter] = [HumanOutputFormat(sys.stdout)] if model.verbose >= 1 else []
         model.set_logger(Logger(folder, [*writers, _TensorBoardOnward(folder, checkpoint.steps)]))
     if isinstance(model, OnPolicyAlgorithm) and learn_arguments.get("log_interval", 1) is not None:

@@ -1,6 +1,5 @@
 """The files of a run, laid out and named as RL Zoo does, so that scripts for its folders work here too."""
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,14 +117,6 @@ class RunFolder:
     def log_folder(self) -> Path:
         """File that says where the TensorBoard log is."""
         return self.details / "tensorboard.txt"
-
-    @property
-    def log(self) -> Path | None:
-        """The TensorBoard log, if it is there."""
-        if not self.log_folder.is_file():
-            return None
-        log = Path(os.path.normpath(self.details.absolute() / self.log_folder.read_text(encoding="utf-8").strip()))
-        return log if log.is_dir() else None
 
     @property
     def plot(self) -> Path:
