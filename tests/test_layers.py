@@ -6,7 +6,7 @@ from maths_helpers import box
 from torch import nn
 
 from sb3_symphony.common.ensembles import hidden_layers, mlp
-from sb3_symphony.common.layers import LeakySine, StackedLayerNorm, StackedLinear
+from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropout_mask
 from sb3_symphony.redq.policies import REDQPolicy
 from sb3_symphony.symphony.policies import SymphonyPolicy
 
@@ -72,6 +72,44 @@ def test_layer_norm_of_the_reference():
     dropped = x * th.tensor([1, 0, 1, 1]) / 0.5
     expected = [-0.654654, -1.091089, 0.218218, 1.527525]
     assert layer(dropped.expand(2, 1, -1))[1, 0].tolist() == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("rate", [0.001, 0.01, 0.1, 0.11, 0.5])
+@pytest.mark.parametrize("shape", [(2, 64, 128), (7,), (1,)])
+def test_dropout_masks_drop_each_element_with_the_same_probability_independently(rate, shape):
+    th.manual_seed(0)
+    n_masks = 100 if len(shape) > 1 else 200_000 // shape[0]
+    masks = th.full((n_masks, *shape), math.nan)
+    for mask in masks:
+        draw_dropout_mask(mask, rate)
+    assert masks.unique().tolist() == pytest.approx([0, 1 / (1 - rate)])
+    dropped = (masks == 0).double().flatten(1)  # (n_masks, elements)
+
+    def error(mean, of):  # of a frequency
+        return 4.5 * math.sqrt(mean / of) + 1e-9
+
+    assert dropped.mean().item() == pytest.approx(rate, abs=error(rate, dropped.numel()))
+    for where in (dropped[:, 0], dropped[:, -1]):
+        assert where.mean().item() == pytest.approx(rate, abs=error(rate, len(where)))
+    for gap in (1, 2, 5):  # neighbours within a mask, and the same element of successive ones
+        for first, second in ((dropped[:, :-gap], dropped[:, gap:]), (dropped[:-gap], dropped[gap:])):
+            if first.numel() > 0:
+                both = (first * second).mean().item()
+                assert both == pytest.approx(rate**2, abs=error(rate**2, first.numel()))
+
+
+def test_a_mask_goes_on_where_the_gaps_drawn_at_once_end(monkeypatch):
+    monkeypatch.setattr(th.Tensor, "geometric_", lambda self, rate: self.fill_(3))
+    mask = th.empty(100)
+    draw_dropout_mask(mask, 0.01)
+    assert (mask == 0).nonzero().flatten().tolist() == list(range(2, 100, 3))
+
+
+def test_dropout_of_everything_and_of_nothing():
+    x = th.ones(2, 3)
+    assert Dropout(1.0)(x).tolist() == [[0] * 3] * 2
+    assert th.equal(Dropout(0.0)(x), x)
+    assert th.equal(Dropout(0.5).eval()(x), x)
 
 
 def test_dropout_stands_before_the_normalisation():

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_symphony.common.checks import check_number
-from sb3_symphony.common.layers import LeakySine, StackedLayerNorm, StackedLinear
+from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear
 
 T = TypeVar("T")
 
@@ -95,7 +95,7 @@ def _modules(
     modules: list[nn.Module] = []
     for width, activation_fn, layer_norm, dropout_rate in hidden:
         modules.append(linear(input_dim, width))
-        modules += [nn.Dropout(dropout_rate)] if dropout_rate > 0 else []
+        modules += [Dropout(dropout_rate)] if dropout_rate > 0 else []
         modules += [norm(width)] if layer_norm else []
         modules.append(activation_fn())
         input_dim = width

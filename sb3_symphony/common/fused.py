@@ -24,7 +24,7 @@ from sb3_symphony.common.kernels import (
     output_backward,
     output_forward,
 )
-from sb3_symphony.common.layers import LeakySine, StackedLayerNorm, StackedLinear
+from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropout_mask
 
 aten = th.ops.aten
 
@@ -70,7 +70,7 @@ def activation_of(module: nn.Module) -> Activation | None:
 
 def uncovered(network: StackedMLP) -> str | None:
     """The first layer that has no hand-written passes, ``None`` if all have."""
-    known = (StackedLinear, StackedLayerNorm, nn.Dropout)
+    known = (StackedLinear, StackedLayerNorm, Dropout)
     return next((type(m).__name__ for m in network.layers if type(m) not in known and activation_of(m) is None), None)
 
 
@@ -180,13 +180,13 @@ class Hidden(Layer):
     """
     ``Linear → Dropout → LayerNorm → activation``; dropout and LayerNorm may be missing.
 
-    The dropout masks are those of ``torch.nn.Dropout`` on the CPU with the same generator state.
+    The dropout masks are those of the module with the same generator state.
     """
 
     def __init__(
         self,
         linear: StackedLinear,
-        dropout: nn.Dropout | None,
+        dropout: Dropout | None,
         norm: StackedLayerNorm | None,
         activation: Activation,
         batch_size: int,
@@ -226,8 +226,7 @@ class Hidden(Layer):
         self.input = x.expand(n, -1, -1)
         self.products.forward(self.input, members, self.product[:n])
         if self.dropout is not None and self.dropout.training:
-            keep = 1.0 - self.dropout.p
-            self.mask[:n].bernoulli_(keep).div_(keep if keep > 0 else 1.0)
+            draw_dropout_mask(self.mask[:n], self.dropout.p)
         elif self.dropout is not None:
             self.mask.fill_(1.0)
         self._forward(members)
@@ -292,7 +291,7 @@ class FusedNetwork:
         while len(modules) > 1:
             linear, following = modules.pop(0), modules.pop(0)
             dropout = norm = None
-            if isinstance(following, nn.Dropout):
+            if isinstance(following, Dropout):
                 dropout, following = following, modules.pop(0)
             if isinstance(following, StackedLayerNorm):
                 norm, following = following, modules.pop(0)

