@@ -18,6 +18,7 @@ from sb3_symphony.common.wrappers import (
     RewardFloor,
     RewardScale,
     StallPenalty,
+    StrideBonus,
     TorsoMass,
     UnseenGoal,
     needs_fresh_world,
@@ -165,6 +166,35 @@ def test_stall_penalty():
     assert rewards == pytest.approx([0.07 * math.log(1e-6)])
 
 
+def test_stride_bonus():
+    # In front of the other by more than .25: nobody, first, nobody, first, second, nobody, second, first
+    leads = [0.0, 0.3, 0.2, 0.4, -0.3, -0.2, -0.3, 0.26]
+    observations = [[9.0, 1.0 + 0.1 + lead, 1.0] for lead in leads]
+    env = StrideBonus(Scripted([0.5] * 7, observations), bonus=2.0, hips=(1, 2), offset=0.1, margin=0.25)
+    for _ in range(2):  # an episode knows nothing of the one before
+        rewards, _, _, infos = play(env)
+        assert rewards == [0.5, 0.5, 0.5, 2.5, 0.5, 0.5, 2.5]
+        assert infos[-1]["episode"]["r"] == pytest.approx(3.5)
+
+
+def test_stride_bonus_on_the_walker():
+    """A leg that swings past the other earns it once; mirrored actions earn the same."""
+    counts = []
+    for legs_apart in ([1.0, -1.0, -1.0, 1.0], [-1.0, 1.0, 1.0, -1.0]):
+        env = StrideBonus(gym.make("BipedalWalker-v3"), bonus=1.0)
+        env.reset(seed=0)
+        earned = []
+        for sign in [1, -1, 1]:
+            for _ in range(25):
+                observation, reward, _, _, info = env.step(sign * np.array(legs_apart, dtype=np.float32))
+                earned.append(reward - info["raw_reward"])
+                legs = env.unwrapped.legs  # upper and lower, of either side
+                apart = legs[0].angle - legs[2].angle
+                assert observation[4] - observation[9] - env.offset == pytest.approx(apart, abs=1e-5)
+        counts.append([round(sum(earned[i : i + 25]), 6) for i in (0, 25, 50)])
+    assert counts == [[0, 1, 1]] * 2
+
+
 @pytest.mark.parametrize(
     "last, penalty, expected", [(0.5, -100, (False, True)), (-100.0, -100, (True, False)), (-20.0, -20, (True, False))]
 )
@@ -201,12 +231,17 @@ def test_wrong_reward_values():
         (lambda: RewardScale(env, scale=0.0), r"scale=0\.0"),
         (lambda: StallPenalty(env, coef=-1.0), r"coef=-1\.0"),
         (lambda: StallPenalty(env, kind="C"), "kind='C'"),
+        (lambda: StrideBonus(env, bonus=float("nan")), "bonus=nan"),
+        (lambda: StrideBonus(env, hips=(0, 2)), "hips=2: expected an integer >= 0 and <= 1"),
+        (lambda: StrideBonus(env, hips=(0,)), r"hips=\(0,\): expected two numbers"),
+        (lambda: StrideBonus(env, hips=(0, 1), margin=-0.1), r"margin=-0\.1"),
     ):
         with pytest.raises(ValueError, match=message):
             make()
     env.observation_space = gym.spaces.Dict({"a": gym.spaces.Box(0, 1)})
-    with pytest.raises(TypeError, match="Box observation space"):
-        StallPenalty(env)
+    for wrapper in (StallPenalty, StrideBonus):
+        with pytest.raises(TypeError, match="Box observation space"):
+            wrapper(env)
 
 
 @pytest.mark.parametrize("through_make_vec_env", [False, True])

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.monitor import Monitor
 
-from sb3_symphony.common.checks import check_choice, check_number
+from sb3_symphony.common.checks import check_choice, check_number, check_pair
 
 
 def _find_wrapper(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> Any:
@@ -221,6 +221,61 @@ class StallPenalty(LearningReward):
         if self.kind == "A":
             return reward + self.coef * (delta - math.log(max(1.0 / (delta + 1e-6), 1e-3)))
         return reward - self.coef * math.log10(1.0 / min(max(delta, 0.1), 10.0))
+
+
+class StrideBonus(LearningReward):
+    """
+    Adds a bonus whenever the leg that was behind comes to the front.
+
+    A biped that keeps one leg in front has a safe gait that costs little and is slow: single steps lead from there to gaits
+    in which the legs pass each other only by way of falls. This tells them apart from the beginning. Defaults are those of
+    BipedalWalker, whose hips have their zeros 0.1 rad apart.
+
+    :param env: environment with a vector as observation
+    :param bonus: added reward, in the environment's units
+    :param hips: indices of the two hip angles in the observation
+    :param offset: first minus second angle with the legs side by side
+    :param margin: what the difference must exceed ``offset`` by, in either direction, for a leg to be in front, >= 0:
+        legs that tremble side by side earn nothing
+    :raises ValueError: for a value outside the ranges above
+    :raises TypeError: if the observation space is not a Box of one axis, or a value of the wrong type
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        bonus: float = 0.5,
+        hips: tuple[int, int] = (4, 9),
+        offset: float = 0.1,
+        margin: float = 0.25,
+    ) -> None:
+        check_number("bonus", bonus)
+        space = env.observation_space
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            raise TypeError(f"StrideBonus: expected a Box observation space of one axis, got {space}")
+        check_pair("hips", hips, "indices of the hip angles", 0, space.shape[0] - 1, integer=True)
+        check_number("offset", offset)
+        check_number("margin", margin, 0)
+        self.bonus, self.hips, self.offset, self.margin = float(bonus), hips, float(offset), float(margin)
+        self.in_front: bool | None = None  # whether the first leg was the last one in front
+        super().__init__(env)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: seed of the episode
+        :param options: handed to the environment
+        :return: first observation and info
+        """
+        self.in_front = None
+        return self.env.reset(seed=seed, options=options)
+
+    def learning_reward(self, observation: Any, reward: float) -> float:
+        first, second = self.hips
+        lead = float(observation[first]) - float(observation[second]) - self.offset
+        if abs(lead) <= self.margin:
+            return reward
+        before, self.in_front = self.in_front, lead > 0
+        return reward + self.bonus if before is (not self.in_front) else reward
 
 
 class UnseenGoal(LearningReward):
