@@ -260,6 +260,7 @@ def stacked(env: VecEnv, settings: RunSettings) -> VecEnv:
         return env
     try:
         return VecFrameStack(env, settings.frame_stack)
+    # Among what SB3 raises: AssertionError for Discrete, TypeError for one within a Dict, NotImplementedError for nested Dicts
     except (ValueError, TypeError, AssertionError, NotImplementedError) as error:
         raise ConfigError(f"frame_stack: observations of {env.observation_space} cannot be stacked — {error}") from None
 
