@@ -254,11 +254,17 @@ def test_mistakes_of_what_goes_beyond_a_grid(write, changes, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-STUDIES = sorted((Path(__file__).parents[1] / "benchmarks" / "studies").glob("*/study.yml"))
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+STUDIES = [path for path in sorted((BENCHMARKS / "studies").glob("*/*.yml")) if "\nalgorithms:\n" in path.read_text()]
+
+
+def _name(path):
+    """Of a shipped study and of its folder in benchmarks/results."""
+    return path.parent.name if path.stem == "study" else f"{path.parent.name}_{path.stem}"
 
 
 @pytest.mark.parametrize("quick", [False, True], ids=["full", "quick"])
-@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", STUDIES, ids=_name)
 def test_shipped_studies(path, quick, tmp_path, capsys, monkeypatch):
     if "Hopper" in path.read_text():
         pytest.importorskip("mujoco")
@@ -268,23 +274,22 @@ def test_shipped_studies(path, quick, tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "results").exists()
 
 
-def _has_page(study):
-    page = study.parent / "README.md"
-    return page.is_file() and "<!-- results -->" in page.read_text(encoding="utf-8")
+def _page(study):
+    return study.with_name("README.md" if study.stem == "study" else f"{study.stem}.md")
 
 
-PAGES = [path for path in STUDIES if _has_page(path)]
+PAGES = [path for path in STUDIES if _page(path).is_file() and "<!-- results -->" in _page(path).read_text(encoding="utf-8")]
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.parent.name)
+@pytest.mark.parametrize("path", PAGES, ids=_name)
 def test_pages_are_made_from_the_raw_files(path, tmp_path):
-    raw, results = path.parents[2] / "results" / path.parent.name, tmp_path / "results"
+    raw, results = BENCHMARKS / "results" / _name(path), tmp_path / "results"
     if raw.is_dir():
         shutil.copytree(raw, results)
     else:  # nothing has been run
         (results / cells_of(read_study(path), path.parent)[0].name).mkdir(parents=True)
-    written = (path.parent / "README.md").read_text(encoding="utf-8")
-    page = tmp_path / "README.md"
+    written = _page(path).read_text(encoding="utf-8")
+    page = tmp_path / "page.md"
     page.write_text(written, encoding="utf-8")
     assert main(["bench", str(path), "--report", "-f", str(results), "--page", str(page)]) == 0
     assert page.read_text(encoding="utf-8") == written
