@@ -235,7 +235,7 @@ CONTROLS = STUDIES / "bipedalwalker" / "controls.py"
     ("control", "ours", "own"),
     [
         ("td3", "symphony", ["learning_rate", "tau", "n_timesteps", "saturation_penalty"]),
-        ("sac", "redq", ["n_timesteps", "ent_coef", "target_entropy"]),
+        ("sac", "droq", ["n_timesteps", "ent_coef", "target_entropy"]),
     ],
 )
 def test_controls_are_given_what_ours_are_given(control, ours, own):
@@ -243,8 +243,8 @@ def test_controls_are_given_what_ours_are_given(control, ours, own):
     ours = yaml.safe_load((STUDIES.parents[1] / "hyperparams" / f"{ours}.yml").read_text())["BipedalWalker-v3"]
     theirs.update(theirs["policy_kwargs"])
     ours.update(ours["policy_kwargs"])
-    common = ["env_wrapper", "learning_starts", "batch_size", "gradient_steps", "action_noise", "net_arch", "actor_averaging"]
-    for key in [*common, *own]:
+    common = ["env_wrapper", "learning_starts", "batch_size", "gradient_steps", "net_arch", "actor_averaging"]
+    for key in [*common, "action_noise", "callback", *own]:
         assert theirs.get(key) == ours.get(key), key
     assert theirs["replay_buffer_kwargs"]["n_steps"] == ours["n_steps"]  # SB3's own argument reaches no buffer but its own
     assert theirs["replay_buffer_kwargs"]["mirror"] == ours["replay_buffer_kwargs"]["mirror"]
