@@ -244,7 +244,8 @@ def test_controls_are_given_what_ours_are_given(control, ours, own):
     theirs.update(theirs["policy_kwargs"])
     ours.update(ours["policy_kwargs"])
     common = ["env_wrapper", "learning_starts", "batch_size", "gradient_steps", "net_arch", "actor_averaging"]
-    for key in [*common, "action_noise", "callback", *own]:
+    common += ["action_noise", "callback"]
+    for key in [*common, *own]:
         assert theirs.get(key) == ours.get(key), key
     assert theirs["replay_buffer_kwargs"]["n_steps"] == ours["n_steps"]  # SB3's own argument reaches no buffer but its own
     assert theirs["replay_buffer_kwargs"]["mirror"] == ours["replay_buffer_kwargs"]["mirror"]
