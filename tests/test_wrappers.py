@@ -168,13 +168,15 @@ def test_stall_penalty():
 
 def test_stride_bonus():
     # In front of the other by more than .25: nobody, first, nobody, first, second, nobody, second, first
-    leads = [0.0, 0.3, 0.2, 0.4, -0.3, -0.2, -0.3, 0.26]
+    leads = [0.0, 0.3, 0.2, 0.4, -0.3, -0.2, -0.3, 0.6]
     observations = [[9.0, 1.0 + 0.1 + lead, 1.0] for lead in leads]
-    env = StrideBonus(Scripted([0.5] * 7, observations), bonus=2.0, hips=(1, 2), offset=0.1, margin=0.25)
-    for _ in range(2):  # an episode knows nothing of the one before
-        rewards, _, _, infos = play(env)
-        assert rewards == [0.5, 0.5, 0.5, 2.5, 0.5, 0.5, 2.5]
-        assert infos[-1]["episode"]["r"] == pytest.approx(3.5)
+    for per_radian, fourth, last in ((False, 2.5, 2.5), (True, 0.5 + 2 * 0.4, 0.5 + 2 * 0.3)):
+        wide = dict(bonus=2.0, hips=(1, 2), offset=0.1, margin=0.25, per_radian=per_radian)
+        env = StrideBonus(Scripted([0.5] * 7, observations), **wide)
+        for _ in range(2):  # an episode knows nothing of the one before
+            rewards, _, _, infos = play(env)
+            assert rewards == pytest.approx([0.5, 0.5, 0.5, fourth, 0.5, 0.5, last])
+            assert infos[-1]["episode"]["r"] == pytest.approx(3.5)
 
 
 def test_stride_bonus_on_the_walker():
@@ -235,6 +237,7 @@ def test_wrong_reward_values():
         (lambda: StrideBonus(env, hips=(0, 2)), "hips=2: expected an integer >= 0 and <= 1"),
         (lambda: StrideBonus(env, hips=(0,)), r"hips=\(0,\): expected two numbers"),
         (lambda: StrideBonus(env, hips=(0, 1), margin=-0.1), r"margin=-0\.1"),
+        (lambda: StrideBonus(env, hips=(0, 1), per_radian="yes"), "per_radian='yes'"),
     ):
         with pytest.raises(ValueError, match=message):
             make()

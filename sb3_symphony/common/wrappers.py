@@ -237,6 +237,8 @@ class StrideBonus(LearningReward):
     :param offset: first minus second angle with the legs side by side
     :param margin: what the difference must exceed ``offset`` by, in either direction, for a leg to be in front, >= 0:
         legs that tremble side by side earn nothing
+    :param per_radian: pay the bonus for each radian by which the other leg has been in front: otherwise many short
+        strides, a slow gait, earn more than few wide ones
     :raises ValueError: for a value outside the ranges above
     :raises TypeError: if the observation space is not a Box of one axis, or a value of the wrong type
     """
@@ -248,6 +250,7 @@ class StrideBonus(LearningReward):
         hips: tuple[int, int] = (4, 9),
         offset: float = 0.1,
         margin: float = 0.25,
+        per_radian: bool = False,
     ) -> None:
         check_number("bonus", bonus)
         space = env.observation_space
@@ -256,8 +259,11 @@ class StrideBonus(LearningReward):
         check_pair("hips", hips, "indices of the hip angles", 0, space.shape[0] - 1, integer=True)
         check_number("offset", offset)
         check_number("margin", margin, 0)
+        check_choice("per_radian", per_radian, [False, True])
         self.bonus, self.hips, self.offset, self.margin = float(bonus), hips, float(offset), float(margin)
+        self.per_radian = per_radian
         self.in_front: bool | None = None  # whether the first leg was the last one in front
+        self.width = 0.0  # the most by which it has been in front since, in radians
         super().__init__(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -266,7 +272,7 @@ class StrideBonus(LearningReward):
         :param options: handed to the environment
         :return: first observation and info
         """
-        self.in_front = None
+        self.in_front, self.width = None, 0.0
         return self.env.reset(seed=seed, options=options)
 
     def learning_reward(self, observation: Any, reward: float) -> float:
@@ -275,7 +281,11 @@ class StrideBonus(LearningReward):
         if abs(lead) <= self.margin:
             return reward
         before, self.in_front = self.in_front, lead > 0
-        return reward + self.bonus if before is (not self.in_front) else reward
+        if before is (not self.in_front):
+            reward += self.bonus * (self.width if self.per_radian else 1.0)
+            self.width = 0.0
+        self.width = max(self.width, abs(lead))
+        return reward
 
 
 class UnseenGoal(LearningReward):
