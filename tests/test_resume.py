@@ -177,7 +177,7 @@ VARIANTS = {
                 "gymnasium.wrappers.NormalizeObservation",
                 {"gymnasium.wrappers.TimeAwareObservation": {}},
                 {"sb3_symphony.common.wrappers.StallPenalty": {"coef": 0.05}},
-                "sb3_symphony.common.wrappers.StrideBonus",
+                {"sb3_symphony.common.wrappers.StrideBonus": {"per_radian": True}},
                 {"sb3_symphony.common.wrappers.EpisodeStepLimit": {"max_steps": 30, "until_total_steps": 150}},
             ],
         },
