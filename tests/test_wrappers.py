@@ -168,15 +168,23 @@ def test_stall_penalty():
 
 def test_stride_bonus():
     # In front of the other by more than .25: nobody, first, nobody, first, second, nobody, second, first
-    leads = [0.0, 0.3, 0.2, 0.4, -0.3, -0.2, -0.3, 0.6]
+    leads = [0.0, 0.3, 0.2, 0.4, -0.3, -0.2, -0.3, 0.26]
     observations = [[9.0, 1.0 + 0.1 + lead, 1.0] for lead in leads]
-    for per_radian, fourth, last in ((False, 2.5, 2.5), (True, 0.5 + 2 * 0.4, 0.5 + 2 * 0.3)):
-        wide = dict(bonus=2.0, hips=(1, 2), offset=0.1, margin=0.25, per_radian=per_radian)
-        env = StrideBonus(Scripted([0.5] * 7, observations), **wide)
-        for _ in range(2):  # an episode knows nothing of the one before
-            rewards, _, _, infos = play(env)
-            assert rewards == pytest.approx([0.5, 0.5, 0.5, fourth, 0.5, 0.5, last])
-            assert infos[-1]["episode"]["r"] == pytest.approx(3.5)
+    env = StrideBonus(Scripted([0.5] * 7, observations), bonus=2.0, hips=(1, 2), offset=0.1, margin=0.25)
+    for _ in range(2):  # an episode knows nothing of the one before
+        rewards, _, _, infos = play(env)
+        assert rewards == [0.5, 0.5, 0.5, 2.5, 0.5, 0.5, 2.5]
+        assert infos[-1]["episode"]["r"] == pytest.approx(3.5)
+
+
+def test_stride_bonus_by_width():
+    # The first leg is in front by .4 at most, then the second by .3, then the first by .6: unpaid, not taken along
+    observations = [[9.0, 1.0 + 0.1 + lead, 1.0] for lead in (0.0, 0.3, 0.4, -0.3, -0.2, 0.6)]
+    env = StrideBonus(Scripted([0.5] * 5, observations), bonus=2.0, hips=(1, 2), offset=0.1, margin=0.25, per_radian=True)
+    for _ in range(2):
+        rewards, _, _, infos = play(env)
+        assert rewards == pytest.approx([0.5, 0.5, 0.5 + 2 * 0.4, 0.5, 0.5 + 2 * 0.3])
+        assert infos[-1]["episode"]["r"] == pytest.approx(2.5)
 
 
 def test_stride_bonus_on_the_walker():
