@@ -252,6 +252,17 @@ def test_an_ended_trajectory_of_single_steps_needs_no_mark(buffer_class):
     assert not buffer.dones.any()
 
 
+@pytest.mark.parametrize("buffer_class", [FadingReplayBuffer, NStepReplayBuffer])
+def test_an_ended_trajectory_bootstraps_whatever_timeouts_mean(buffer_class):
+    buffer = buffer_class(100, OBS, ACT, n_steps=3, gamma=0.5, handle_timeout_termination=False)
+    fill(buffer, 10)
+    end_trajectory(buffer)
+    fill(buffer, 3)
+    samples = buffer._get_samples(np.arange(10))
+    assert not samples.dones.any()
+    np.testing.assert_allclose(samples.discounts.flatten(), [0.125] * 8 + [0.25, 0.5])
+
+
 @pytest.mark.parametrize("done, timeout", [(0, 0), (1, 0), (1, 1)])
 def test_an_ended_trajectory_stays_terminated_if_it_was(done, timeout):
     buffer = NStepReplayBuffer(20, OBS, ACT, n_steps=3, gamma=0.5)

@@ -1,11 +1,15 @@
 import math
 
+import numpy as np
 import pytest
 import torch as th
 from maths_helpers import box
+from numba import njit
+from numba.core.caching import CacheImpl
 from torch import nn
 
 from sb3_symphony.common.ensembles import hidden_layers, mlp
+from sb3_symphony.common.kernels import LEAKY_RELU, layer_forward
 from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropout_mask
 from sb3_symphony.redq.policies import REDQPolicy
 from sb3_symphony.symphony.policies import SymphonyPolicy
@@ -258,3 +262,14 @@ def test_redraw_changes_the_weights_of_linear_layers_only():
     for module in linears.values():
         bound = math.sqrt(6 / sum(module.weight.shape))
         assert 0.98 * bound < module.weight.abs().max().item() <= bound + 1e-7
+
+
+def test_kernels_compile_where_nothing_can_be_cached(monkeypatch):
+    """numba refuses where neither the package's folder nor the user's can be written to, as in many containers."""
+    monkeypatch.setattr(CacheImpl, "_locator_classes", [])
+    with pytest.raises(RuntimeError, match="cannot cache"):
+        njit(cache=True)(lambda x: x)
+    forward = layer_forward.__wrapped__(layer_norm=False, dropout=False, activation=LEAKY_RELU)
+    product, bias, unused = np.array([[[1.0, -2.0]]]), np.array([[[0.5, 0.5]]]), np.zeros((1, 1, 2))
+    forward(product, bias, unused, unused, unused, 0.0, 0.1, unused[0], unused, unused, np.array([0]))
+    np.testing.assert_allclose(product, [[[1.5, -0.15]]])

@@ -139,8 +139,10 @@ def test_under_sb3(cls):
 def test_not_with_normalised_observations(make):
     kwargs = dict(mirror={"observation": {"negate": [1, 2]}, "action": {"negate": [0]}})
     env = VecNormalize(make_vec_env("Pendulum-v1"))
+    model = make(env, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=kwargs)
     with pytest.raises(ValueError, match="norm_obs=False"):
-        make(env, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=kwargs).learn(40)
+        model.learn(40)
+    assert model.num_timesteps == 0  # not after a warm-up
     env = VecNormalize(make_vec_env("Pendulum-v1"), norm_obs=False)
     make(env, replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=kwargs).learn(40)
 

@@ -136,6 +136,19 @@ def test_equals_a_slow_computation(cls):
     )
 
 
+def test_actions_of_several_axes():
+    class Table(Chain):
+        action_space = gym.spaces.Box(-2.0, 2.0, (2, 3))
+
+        def step(self, action):
+            assert action.shape == (2, 3)
+            return super().step(action[0])
+
+    model = small(REDQ, Table())
+    model.learn(40)
+    assert np.isfinite(q_bias(model, Table(), n_pairs=8, max_episode_steps=5).mean)
+
+
 def test_perfect_critics_have_no_bias():
     """Critics set to a constant that is every return: reward 1, gamma 0.5, cut by the time limit."""
 

@@ -1,4 +1,5 @@
 import copy
+import inspect
 
 import pytest
 import torch as th
@@ -120,6 +121,11 @@ def test_losses(loss, reduction, weighted):
 )
 def test_optimizers(optimizer, optimizer_kwargs):
     assert_equal_runs(*pair(optimizer=optimizer, optimizer_kwargs=optimizer_kwargs))
+
+
+@pytest.mark.skipif("decoupled_weight_decay" not in inspect.signature(th.optim.Adam).parameters, reason="an older torch")
+def test_decoupled_weight_decay_of_adam():
+    assert_equal_runs(*pair(optimizer_kwargs=dict(weight_decay=0.5, decoupled_weight_decay=True)))
 
 
 @pytest.mark.parametrize("net_arch", [[], [7], [16, 8, 12], [1, 1]], ids=str)
@@ -268,6 +274,48 @@ def test_bfloat16_where_the_processor_lacks_it(small, algorithm, monkeypatch):
         small(algorithm, policy_kwargs=dict(critic_engine="bf16"))
 
 
+@pytest.mark.parametrize("engine", ["bf16", "fused"])
+def test_loaded_where_the_engine_is_impossible(small, algorithm, engine, monkeypatch, tmp_path):
+    """A model trained on a server acts, and goes on learning, on another machine."""
+    monkeypatch.setattr("sb3_symphony.common.regression.has_bfloat16", lambda: True)
+    model = small(algorithm, policy_kwargs=dict(critic_engine=engine))
+    model.save(tmp_path / "model")
+    monkeypatch.setattr("sb3_symphony.common.regression.has_bfloat16", lambda: False)
+    monkeypatch.setattr("sb3_symphony.common.regression.not_fusable", lambda _: "reason" if engine == "fused" else None)
+    with pytest.warns(UserWarning, match=f"critic_engine='{engine}' is not possible.*'auto'"):
+        loaded = algorithm.load(tmp_path / "model", env=model.env)
+    assert type(loaded._regression) is (CriticRegression if engine == "fused" else FusedRegression)
+    loaded.learn(30)
+
+
+# Frozen parameters ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", ["autograd", "fused"])
+def test_frozen_layers_stay_as_they_are(small, algorithm, engine):
+    model = small(algorithm, policy_kwargs=dict(critic_engine=engine))
+    networks = model.actor, model.critic
+    frozen = [next(parameter for parameter in network.parameters() if parameter.ndim > 1) for network in networks]
+    before = [parameter.detach().clone() for parameter in frozen]
+    last = [list(network.parameters())[-1] for network in networks]
+    start = [parameter.detach().clone() for parameter in last]
+    for parameter in frozen:
+        parameter.requires_grad = False
+    model.learn(60)
+    assert all(map(th.equal, frozen, before)) and not any(map(th.equal, last, start))
+
+
+def test_frozen_for_a_while():
+    def on_update(i, fitter):
+        for parameter in list(fitter.critic.q_networks.parameters())[:2]:
+            parameter.requires_grad = i % 20 >= 10
+
+    fitters = pair()
+    for fitter in fitters:
+        run(fitter, on_update=on_update)
+    assert_equal_states(*fitters)
+
+
 # State of the optimiser -----------------------------------------------------------------------------------------------
 
 
@@ -298,6 +346,18 @@ def test_weights_loaded_between_updates_are_used():
         fitter.critic_target.load_state_dict(other.critic_target.state_dict())
         run(fitter, 5, first=5)
     assert_equal_states(reference, fused)
+
+
+def test_state_reset_between_updates():
+    """Of the last layer, as where networks are partly drawn anew: the moments of the others go on."""
+    fitters = pair()
+    for fitter in fitters:
+        run(fitter, 5)
+        for parameter in fitter.critic.q_networks.layers[-1].parameters():
+            del fitter.critic.optimizer.state[parameter]
+        run(fitter, 5, first=5)
+        assert {float(state["step"]) for state in fitter.critic.optimizer.state.values()} == {5.0, 10.0}
+    assert_equal_states(*fitters)
 
 
 @pytest.mark.parametrize("policy_class", [REDQPolicy, SymphonyPolicy])

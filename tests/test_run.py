@@ -379,6 +379,17 @@ def test_priorities_follow_the_errors(make):
     assert len(np.unique(model.replay_buffer.tree.get(np.arange(21)))) > 15
 
 
+def test_priorities_guide_the_next_update(make, monkeypatch):
+    """Not only the next call of ``train()``, which may be a whole episode later."""
+    model = make(replay_buffer_class=PrioritizedReplayBuffer).learn(21)
+    buffer, calls = model.replay_buffer, []
+    sample, update_priorities = buffer.sample, buffer.update_priorities
+    monkeypatch.setattr(buffer, "sample", lambda *args, **kwargs: calls.append("sample") or sample(*args, **kwargs))
+    monkeypatch.setattr(buffer, "update_priorities", lambda *args: calls.append("update") or update_priorities(*args))
+    model.train(gradient_steps=4, batch_size=16)
+    assert calls == ["sample", "update"] * 4
+
+
 @pytest.mark.parametrize("cls", [TD3, SAC])
 def test_fading_buffer_under_sb3_algorithms(cls, pendulum):
     model = cls(

@@ -291,6 +291,15 @@ def test_arguments_given_to_load(make, algorithm, tmp_path):
         algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[32]))
 
 
+@pytest.mark.parametrize(("before", "after"), [(1, 3), (3, 1)])
+def test_n_steps_may_change_at_load(make, algorithm, tmp_path, before, after):
+    model = make(n_steps=before).learn(40)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env=model.env, n_steps=after)
+    assert getattr(loaded.replay_buffer, "n_steps", 1) == after
+    loaded.learn(30)
+
+
 def test_learning_rate_may_change_at_load(make, algorithm, tmp_path):
     model = make().learn(40)
     model.save(tmp_path / "model")

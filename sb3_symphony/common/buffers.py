@@ -167,11 +167,8 @@ class _StepsReplayBuffer(NStepReplayBuffer):
         one_step = self.n_steps == 1
         get_samples = partial(ReplayBuffer._get_samples, self) if one_step else super()._get_samples
         samples = get_samples(batch_inds, env=env)
-        if self.mirror is None:
-            return samples
-        if env is not None and env.norm_obs:
-            raise ValueError("mirror: expected observations as they are, not normalised ones (norm_obs=False)")
-        return self.mirror(samples)
+        check_mirror(self, env)
+        return samples if self.mirror is None else self.mirror(samples)
 
     def _gather(self, rows: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None) -> ReplayBufferSamples:
         """SB3 draws the environment of a row itself: show it one environment at a time, then restore the drawn order."""
@@ -380,6 +377,18 @@ class FadingDictReplayBuffer(_FadedSampling, DictReplayBuffer):
         )
 
 
+def check_mirror(buffer: ReplayBuffer | None, env: VecNormalize | None) -> None:
+    """
+    Mirrored transitions need observations whose left and right have one scale.
+
+    :param buffer: replay buffer, of any kind
+    :param env: what normalises its samples
+    :raises ValueError: if it mirrors and observations are normalised
+    """
+    if getattr(buffer, "mirror", None) is not None and env is not None and env.norm_obs:
+        raise ValueError("mirror: expected observations as they are, not normalised ones (norm_obs=False)")
+
+
 def end_trajectory(buffer: ReplayBuffer) -> None:
     """
     Mark that the latest transition is not followed by the next one to come: the environments start anew.
@@ -393,7 +402,7 @@ def end_trajectory(buffer: ReplayBuffer) -> None:
     elif getattr(buffer, "n_steps", 1) > 1 or buffer.optimize_memory_usage:
         # Others need no mark: they bootstrap from the next observation that they stored
         last = buffer.pos - 1
-        if buffer.handle_timeout_termination:
+        if not buffer.optimize_memory_usage:  # else the next observation will be that of another episode
             buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], buffer.dones[last] == 0)
         buffer.dones[last] = 1
     if isinstance(buffer, FadingReplayBuffer):

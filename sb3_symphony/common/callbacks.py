@@ -94,7 +94,7 @@ def _mean_q(critic: Any, observations: Any, actions: th.Tensor) -> th.Tensor:
 
 
 class _Step(NamedTuple):
-    action: np.ndarray  # in the environment's units, (1, action_dim)
+    action: np.ndarray  # in the environment's units, (1, *action_space.shape)
     q_value: float
     bonus: float
 
@@ -114,7 +114,8 @@ def _act(model: OffPolicyAlgorithm, observation: Any, ent_coef: float) -> _Step:
     else:
         action = actor(tensor)
     q_value = float(_mean_q(policy.critic, tensor, action))
-    return _Step(policy.unscale_action(action.cpu().numpy()), q_value, bonus)
+    scaled = action.cpu().numpy().reshape(-1, *policy.action_space.shape)
+    return _Step(policy.unscale_action(scaled), q_value, bonus)
 
 
 def _ent_coef(model: Any) -> float:

@@ -16,8 +16,20 @@ from functools import cache
 import numpy as np
 from numba import njit
 
+
+def _compiler(fastmath: set[str]) -> Callable[[Callable], Callable]:
+    def compiled(function: Callable) -> Callable:
+        try:
+            return njit(fastmath=fastmath, error_model="numpy", cache=True)(function)
+        except RuntimeError:  # numba finds no folder it may write to: each process compiles for itself
+            return njit(fastmath=fastmath, error_model="numpy")(function)
+
+    return compiled
+
+
 # Sums may be reordered, as in torch; NaN and infinity stay what they are, or a diverged run would look healthy
-_compiled = njit(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy", cache=True)
+_compiled = _compiler({"reassoc", "contract", "arcp", "nsz"})
+_compiled_in_order = _compiler({"contract"})
 
 IDENTITY, LEAKY_RELU, LEAKY_SINE = range(3)
 
@@ -28,7 +40,7 @@ _PI_HIGH = 3.140625  # few bits, so its products with small integers are exact
 _PI_LOW = math.pi - _PI_HIGH
 
 
-@njit(fastmath={"contract"}, error_model="numpy", cache=True)  # the order of the reduction matters
+@_compiled_in_order  # that of the reduction matters
 def _sin_cos(x, real):
     """Sine and cosine of one value; unlike ``math.sin`` it vectorises. Precise for values of a few thousands at most."""
     turns = np.rint(x * real(1 / math.pi))

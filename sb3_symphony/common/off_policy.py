@@ -1,6 +1,7 @@
 """What Symphony and REDQ share: everything that SB3 expects of an off-policy algorithm with an ensemble of critics."""
 
 import inspect
+import warnings
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -14,7 +15,13 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer, end_trajectory
+from sb3_symphony.common.buffers import (
+    FadingDictReplayBuffer,
+    FadingReplayBuffer,
+    PrioritizedReplayBuffer,
+    check_mirror,
+    end_trajectory,
+)
 from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CRITIC_LOSSES
@@ -77,6 +84,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.critic_loss = critic_loss
         self.critic_reduction = critic_reduction
         self._timesteps_at_update = 0
+        self._was_set_up = False  # in a saved model: True
 
     def _check_arguments(self) -> None:
         """Of a new model, and of a loaded one, whose arguments may have been replaced."""
@@ -110,9 +118,10 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         self._check_arguments()
-        n_steps, chosen, given = self.n_steps, self.replay_buffer_class, self.replay_buffer_kwargs
+        n_steps, given_class, given = self.n_steps, self.replay_buffer_class, self.replay_buffer_kwargs
         if isinstance(self.observation_space, spaces.Dict) and n_steps > 1:
             raise ValueError(f"n_steps={n_steps}: expected 1 for Dict observations, as in SB3")
+        chosen = given_class
         if chosen is None:
             for_dict, for_n_steps, otherwise = self.default_buffers
             is_dict = isinstance(self.observation_space, spaces.Dict)
@@ -130,11 +139,21 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         # SB3 takes a given class for one without n-step returns, and warns: the buffer has its horizon already
         self.n_steps = 1
         super()._setup_model()
-        self.n_steps, self.replay_buffer_kwargs = n_steps, given
+        self.n_steps, self.replay_buffer_class, self.replay_buffer_kwargs = n_steps, given_class, given
         self._create_aliases()
-        self._regression = make_regression(
-            self.critic, self.critic_target, self.critic_loss, self.critic_reduction, self.policy.critic_engine
-        )
+        self._create_regression()
+        self._was_set_up = True
+
+    def _create_regression(self) -> None:
+        parts = self.critic, self.critic_target, self.critic_loss, self.critic_reduction
+        try:
+            self._regression = make_regression(*parts, self.policy.critic_engine)
+        except ValueError as error:
+            if not self._was_set_up:
+                raise
+            # Loaded on another kind of machine, maybe only to act
+            warnings.warn(f"{error}. Should the loaded model be trained, it is with 'auto'", stacklevel=2)
+            self._regression = make_regression(*parts, "auto")
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -152,6 +171,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         for each in noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]:
             if isinstance(each, DecayingActionNoise):
                 each.n_envs = self.env.num_envs  # a decay counts environment steps
+        check_mirror(self.replay_buffer, self._vec_normalize_env)  # now, not after the warm-up
         last_obs = self._last_obs
         result = super()._setup_learn(*args, **kwargs)
         if self._last_obs is not last_obs and self.replay_buffer is not None:  # the environments were reset
@@ -177,8 +197,9 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         row_bytes = 8 * get_flattened_obs_dim(self.observation_space)  # two observations in single precision
         updates_per_draw = max(1, MAX_SAMPLE_BYTES // (row_bytes * batch_size))
-        if isinstance(self.replay_buffer, HerReplayBuffer):
-            updates_per_draw = 1  # its samples are sorted, those with their real goal first: not to be cut
+        if isinstance(self.replay_buffer, HerReplayBuffer | PrioritizedReplayBuffer):
+            # Samples with their real goal come first, not to be cut; priorities change with every update
+            updates_per_draw = 1
         while gradient_steps > 0:
             draw = min(gradient_steps, updates_per_draw)
             samples = self.replay_buffer.sample(draw * batch_size, env=self._vec_normalize_env, **sample_kwargs)

@@ -145,6 +145,8 @@ class FusedRegression(CriticRegression):
         tau: float,
         weights: th.Tensor | None = None,
     ) -> Fit:
+        if not all(parameter.requires_grad for parameter in self.critic.q_networks.parameters()):
+            return super().fit(observations, actions, target, tau, weights)  # which leaves frozen layers as they are
         with th.no_grad():
             network = self._network(self.critic, len(actions))
             features = self.critic.extract_features(observations, self.critic.features_extractor)
@@ -178,8 +180,8 @@ class FusedRegression(CriticRegression):
         """Adam and Polyak of all parameters, whose state is kept where torch's optimiser keeps it."""
         optimizer = self.critic.optimizer
         states = [optimizer.state[parameter] for parameter in network.parameters]
-        if not all(states):  # as Adam itself does at its first step
-            for parameter, state in zip(network.parameters, states, strict=True):
+        for parameter, state in zip(network.parameters, states, strict=True):
+            if not state:  # as Adam itself does at a parameter's first step
                 state["step"] = th.zeros((), dtype=th.float32)
                 state.update(exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter))
         swept, addresses = self._swept[0], [state["exp_avg"].data_ptr() for state in states]
@@ -192,7 +194,7 @@ class FusedRegression(CriticRegression):
                 self._sweeps.append(partial(adam_polyak, *(array(tensor).reshape(-1) for tensor in tensors)))
 
         group = optimizer.param_groups[0]
-        decoupled = isinstance(optimizer, th.optim.AdamW)
+        decoupled = group.get("decoupled_weight_decay", isinstance(optimizer, th.optim.AdamW))
         for sweep in self._sweeps:
             sweep(group["lr"], *group["betas"], group["eps"], group["weight_decay"], decoupled, tau)
 

@@ -61,9 +61,9 @@ class Actor(TD3Actor):
         return self.mu[:-1](self.extract_features(obs, self.features_extractor))
 
     def redraw(self) -> None:
-        """New Xavier-uniform weights in every linear layer; biases and LayerNorm stay (the author's warm-up)."""
+        """New Xavier-uniform weights in all linear layers that are not frozen; biases and LayerNorm stay (the author's warm-up)."""
         for module in self.mu:
-            if isinstance(module, nn.Linear):
+            if isinstance(module, nn.Linear) and module.weight.requires_grad:
                 nn.init.xavier_uniform_(module.weight)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -265,7 +265,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             excess = F.relu(before_tanh.abs() - SATURATED)  # (batch, n_actions)
             actor_loss = actor_loss + self.saturation_penalty * excess.square().sum(dim=1).mean()
         self.actor.optimizer.zero_grad()
-        actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
+        actor_loss.backward(inputs=[each for each in self.actor.parameters() if each.requires_grad])  # not the critics
         self.actor.optimizer.step()
 
         value = q_values.detach().mean()
