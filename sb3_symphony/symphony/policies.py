@@ -61,7 +61,7 @@ class Actor(TD3Actor):
         return self.mu[:-1](self.extract_features(obs, self.features_extractor))
 
     def redraw(self) -> None:
-        """New Xavier-uniform weights in all linear layers that are not frozen; biases and LayerNorm stay (the author's warm-up)."""
+        """New Xavier-uniform weights in linear layers, but for frozen ones; biases and LayerNorm stay (author's warm-up)."""
         for module in self.mu:
             if isinstance(module, nn.Linear) and module.weight.requires_grad:
                 nn.init.xavier_uniform_(module.weight)
