@@ -74,6 +74,7 @@ def test_run_folder(folder, capsys):
 def test_our_algorithms_train(algo):
     result = train(options(algo, n_timesteps=220, hyperparams={**SMALL, "gradient_steps": 1, "policy_delay": 1}))
     assert result.run.model.exists() and result.steps == 220
+    assert not result.run.log_folder.exists()  # there is no TensorBoard log
 
 
 def test_walker_with_shipped_settings():

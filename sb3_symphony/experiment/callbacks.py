@@ -214,7 +214,7 @@ class NoteLogFolder(BaseCallback):
 
     def _on_training_start(self) -> None:
         folder = self.logger.get_dir()
-        if folder is not None:
+        if self.model.tensorboard_log and folder is not None:  # else SB3's logger has an empty one among the temporary ones
             self.path.write_text(f"{os.path.relpath(folder, self.path.parent)}\n", encoding="utf-8")
 
     def _on_step(self) -> bool:
