@@ -184,3 +184,6 @@ def test_groups_are_told_apart_by_what_differs(tmp_path):
     assert labels == ["sac n_critics 2", "sac n_critics 5", "sac n_critics default", "sac"]
     paths = [make_run(tmp_path, "td3", number=1, a=1, b=1, c=1), make_run(tmp_path, "td3", number=2, a=2, b=2, c=2)]
     assert [group.label for group in group_runs(map(open_run, paths))] == ["td3 1", "td3 2"]
+    wrappers = [{"sb3_symphony.common.wrappers.RewardFloor": {"floor": -30}}]  # too long for a legend
+    paths = [make_run(tmp_path, "ppo", number=1, env_wrapper=wrappers), make_run(tmp_path, "ppo", number=2)]
+    assert [group.label for group in group_runs(map(open_run, paths))] == ["ppo 1", "ppo 2"]

@@ -175,6 +175,20 @@ def test_mistakes(capsys, folder, arguments, message):
     assert not list(folder.iterdir())  # nothing was made
 
 
+def test_a_flag_given_twice_adds(capsys, folder):
+    argv = "train --algo sac --env Pendulum-v1 --dry-run -params gamma:0.5 -params tau:0.25 batch_size:32".split()
+    assert main(argv) == 0
+    lines = [line.partition("#")[0].split() for line in capsys.readouterr().out.splitlines()]
+    for pair in (["gamma:", "0.5"], ["tau:", "0.25"], ["batch_size:", "32"]):
+        assert pair in lines
+
+
+def test_an_environment_whose_module_fails(capsys, folder):
+    (folder / "broken_robot.py").write_text("raise RuntimeError('no robot')")
+    line = fails(capsys, "train", "--env", "broken_robot:X-v0")
+    assert "environment 'broken_robot:X-v0' cannot be made — RuntimeError: no robot" in line
+
+
 def test_nobody_reads_on():
     """``sb3-symphony list | head``"""
     process = subprocess.Popen([sys.executable, "-m", "sb3_symphony", "list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -6,6 +6,7 @@ import pytest
 import torch as th
 import yaml
 from gymnasium import spaces
+from stable_baselines3.common.envs import FakeImageEnv
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -178,7 +179,26 @@ def test_class_names():
         ("sac", "replay_buffer_class", "PrioritizedReplayBuffer", "does not apply its importance weights"),
         ("sac", "action_noise", {"StickyActionNoise": {"sigm": 1}}, "did you mean 'sigma'"),
         ("sac", "action_noise", {"StickyActionNoise": {"sigma": -1}}, "expected a number >= 0"),
+        (
+            "sac",
+            "action_noise",
+            {"NormalActionNoise": {"sigma": "abc"}},
+            "NormalActionNoise: sigma: 'abc' — expected a number or",
+        ),
+        ("sac", "action_noise", {"NormalActionNoise": {"sigma": -1}}, "expected a number >= 0"),
+        (
+            "sac",
+            "action_noise",
+            {"NormalActionNoise": {"sigma": [0.1, 0.2, 0.3]}},
+            "action_noise: NormalActionNoise: could not",
+        ),
+        ("sac", "action_noise", {"OrnsteinUhlenbeckActionNoise": {"sigma": 0.1, "theta": "abc"}}, "theta: 'abc' — expected a"),
         ("sac", "action_noise", 0.1, "action_noise: 0.1 — expected {NameOfTheNoise"),
+        ("sac", "ent_coef", "foo", "ent_coef: 'foo' — expected a number or auto or auto_<number>"),
+        ("tqc", "ent_coef", "auto_foo", "ent_coef: 'auto_foo' — expected"),
+        ("sac", "target_entropy", "foo", "target_entropy: 'foo' — expected a number or auto"),
+        ("symphony", "replay_buffer_kwargs.fade_facto", 3, "did you mean 'fade_factor'"),
+        ("redq", "replay_buffer_kwargs.fade", 3, "unknown replay_buffer_kwargs key 'fade' for"),
         ("sac", "seed", 3, "set on the command line"),
         ("sac", "device", "cpu", "set on the command line"),
         ("sac", "n_envs", 0, "n_envs: 0 — expected a number >= 1"),
@@ -223,6 +243,22 @@ def test_wrappers():
         split_wrappers([("sb3_symphony.common.wrappers.RewardFloor", {"floor": "low"})])
 
 
+def test_episodes_as_a_unit_need_one_environment():
+    assert decode("td3", train_freq=[1, "episode"])["train_freq"] == (1, "episode")
+    with pytest.raises(ConfigError, match=r"train_freq: \[1, 'episode'\] — expected steps where n_envs is 2"):
+        decode("td3", train_freq=[1, "episode"], n_envs=2)
+
+
+@pytest.mark.parametrize("limit", [-1, -1.0, [-1, -0.5, -1, -0.5, -1]])
+def test_arrays_of_wrappers(limit):
+    """Gymnasium annotates such arguments with NumPy's numbers and arrays."""
+    (wrapper,), _ = split_wrappers([("gymnasium.wrappers.RescaleAction", {"min_action": limit, "max_action": 1})])
+    env = wrapper(FakeImageEnv(discrete=False))  # five actions
+    np.testing.assert_array_equal(env.action_space.low, np.broadcast_to(limit, env.action_space.shape))
+    with pytest.raises(ConfigError, match=r"RescaleAction: min_action: 'low' — expected a number or \[a number, …\]"):
+        split_wrappers([("gymnasium.wrappers.RescaleAction", {"min_action": "low", "max_action": 1})])
+
+
 def test_suggestions():
     assert suggestion("bipedalwalker-v3", ["BipedalWalker-v3"]) == ": did you mean 'BipedalWalker-v3'?"
     assert suggestion("zzz", ["sac"]) == ""
@@ -264,6 +300,16 @@ def test_a_number_may_be_text_but_nothing_else(value):
     else:
         with pytest.raises(ConfigError):
             decode(learning_rate=value)
+
+
+def test_misspelt_presets_and_keys(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, message in (("symphony-orignal", "did you mean 'symphony-original'"), ("xyz", "expected a YAML file or one of")):
+        with pytest.raises(ConfigError, match=message):
+            load_config(validated(TrainOptions, {"conf_file": name}))
+    (tmp_path / "own.yml").write_text("n_timestep: 1000")
+    with pytest.raises(ConfigError, match="unknown hyper-parameter 'n_timestep': did you mean 'n_timesteps'"):
+        load_config(validated(TrainOptions, {"conf_file": "own.yml"}))
 
 
 def test_presets_are_found_by_name():

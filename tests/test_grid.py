@@ -468,6 +468,8 @@ def test_a_worker_of_loky_that_dies_is_replaced(folder, die_once):
         ({"algorithms": [{"name": "td3", "conf": "nothing.yml"}]}, "nothing.yml: no such file"),
         ({"protocol": "standard", "environments": [{"id": "Pendulum-v1", "env_kwargs": {"g": 9.0}}]}, "env_kwargs: 'g'"),
         ({"device": "tpu"}, "'tpu'"),
+        ({"matrix": {"label": "g", "conditions": {1: {"env_kwargs": {"gg": 1}}}}}, "condition '1': environment 'Pendulum-v1'"),
+        ({"matrix": {"label": "w", "conditions": {"a": {"env_wrapper": "gymnasium.wrappers.TimeLimt"}}}}, "did you mean"),
         ({"sead": 3}, "unknown option 'sead': did you mean 'seeds'?"),
     ],
 )

@@ -273,6 +273,8 @@ def test_a_run_without_episodes_has_a_figure_too(tmp_path, figures):
         ("--scalars -a td3", "logs/td3/X-v0_1: no TensorBoard log is known"),
         ("--tags train/critic_los", "did you mean 'train/critic_loss'?"),
         ("-l a", "-l: 1 labels — expected 2, for sac, td3"),
+        ("-max 1", "nothing to draw with -max 1"),
+        ("--mean-per 100000", "nothing to draw with --mean-per 100000"),
         ("-y success", "does not tell whether an episode is a success"),
         ("-o picture.bmp", "picture.bmp: expected a name that ends in .png, .svg, .pdf"),
         ("-o none/a.png", "there is no folder none"),
@@ -294,10 +296,14 @@ def test_mistakes(logs, capsys, arguments, message):
 
 
 @pytest.mark.parametrize("content", [b"broken", b""])
-def test_a_damaged_file(logs, capsys, content):
-    (logs / "sac" / "X-v0_2" / "evaluations.npz").write_bytes(content)
-    assert main(["plot", "--evaluations", "-e", "X-v0"]) == 2
-    assert "evaluations.npz: not evaluations of Stable-Baselines3, or damaged" in capsys.readouterr().err
+@pytest.mark.parametrize("name, flags", [("0.monitor.csv", []), ("evaluations.npz", ["--evaluations"])])
+def test_a_damaged_file(logs, capsys, figures, content, name, flags):
+    (logs / "sac" / "X-v0_2" / name).write_bytes(content)
+    assert main(["plot", "-a", "sac", "-e", "X-v0", *flags]) == 0
+    told = capsys.readouterr().err
+    assert told.startswith(f"left out: logs/sac/X-v0_2/{name}: not ") and told.count("\n") == 1
+    assert main(["plot", "logs/sac/X-v0_2", *flags]) == 2
+    assert f"{name}: not " in capsys.readouterr().err
 
 
 def test_logs_that_are_empty_or_gone(logs, capsys):

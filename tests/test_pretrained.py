@@ -2,6 +2,7 @@
 
 import pytest
 
+from sb3_symphony.cli import main
 from sb3_symphony.experiment.enjoy import enjoy
 from sb3_symphony.experiment.evaluate import evaluate
 from sb3_symphony.experiment.select import EnjoyOptions, EvaluateOptions, pretrained_folder
@@ -24,6 +25,22 @@ def test_agent(run, tmp_path, monkeypatch, capsys):
     assert max(episode.reward for episode in result.episodes) > 250  # it walks to the end; one may stumble
     assert "pickled" not in capsys.readouterr().err
     assert sum(path.stat().st_size for path in run.rglob("*")) < 1_000_000
+
+
+@pytest.mark.parametrize(
+    "command, written",
+    [
+        ("gait --skip 0 -n 60 --n-frames 0", "gait.png"),
+        ("video -n 5", "symphony_BipedalWalker-v3.mp4"),
+        ("export", "symphony_BipedalWalker-v3.onnx"),
+    ],
+)
+def test_commands_do_not_write_into_the_package(tmp_path, monkeypatch, command, written):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(pretrained_folder().rglob("*"))
+    assert main(command.split()) == 0
+    assert [path.name for path in tmp_path.iterdir()] == [written]
+    assert sorted(pretrained_folder().rglob("*")) == before
 
 
 def test_enjoy_without_training(tmp_path, monkeypatch, capsys):

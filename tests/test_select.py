@@ -159,12 +159,16 @@ def test_run_of_rl_zoo(folder):
     assert select(model=str(run)).algo == "ppo"
 
 
-def test_pretrained_agents(folder):
+def test_pretrained_agents(folder, capsys):
     make_run(folder / "shipped", algo="symphony", env="BipedalWalker-v3", files=["BipedalWalker-v3.zip"])
-    assert select().model == folder / "shipped" / "symphony" / "BipedalWalker-v3_1" / "BipedalWalker-v3.zip"
+    found = select()
+    assert found.model == folder / "shipped" / "symphony" / "BipedalWalker-v3_1" / "BipedalWalker-v3.zip"
+    assert found.shipped and "no such run in 'logs', this is the agent that comes with" in capsys.readouterr().err
+    fails("logs/symphony: no run of symphony on BipedalWalker-v3", load_best=True)  # it has one model only
     fails("runs/symphony: no run of symphony on BipedalWalker-v3", folder="runs")  # asked for elsewhere
     own = make_run(folder / "logs", algo="symphony", env="BipedalWalker-v3", files=["BipedalWalker-v3.zip"])
-    assert select().model.samefile(own / "BipedalWalker-v3.zip")
+    assert select().model.samefile(own / "BipedalWalker-v3.zip") and not select().shipped
+    assert capsys.readouterr().err == ""
 
 
 def test_no_such_run(folder):

@@ -14,6 +14,10 @@ import numpy as np
 import yaml
 
 
+class Damaged(ValueError):
+    """A file of a run cannot be read."""
+
+
 class NotRecorded(ValueError):
     """Something that is asked for is not in the files of a run."""
 
@@ -88,7 +92,7 @@ def read_episodes(folder: Path) -> Episodes | None:
                 starts.append(float(json.loads(lines.readline().removeprefix("#"))["t_start"]))
                 rows += _monitor_rows(csv.DictReader(lines), starts[-1])
         except (ValueError, KeyError, TypeError, OSError) as error:
-            raise ValueError(f"{path}: not a monitor file of Stable-Baselines3, or damaged — {error}") from None
+            raise Damaged(f"{path}: not a monitor file of Stable-Baselines3, or damaged — {error}") from None
     rows.sort(key=lambda row: row[0])
     ends, returns, lengths, successes = np.array(rows, dtype=float).reshape(-1, 4).T
     return Episodes(
@@ -120,7 +124,7 @@ def read_evaluations(folder: Path) -> Evaluations | None:
 
     :param folder: run folder
     :return: its evaluations, None if there is no such file
-    :raises ValueError: if the file is something else
+    :raises Damaged: if the file is something else
     """
     path = folder / "evaluations.npz"
     if not path.exists():
@@ -130,7 +134,7 @@ def read_evaluations(folder: Path) -> Evaluations | None:
             successes = data["successes"].astype(float) if "successes" in data else None
             return Evaluations(data["timesteps"], data["results"], data["ep_lengths"], successes)
     except (OSError, EOFError, KeyError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not evaluations of Stable-Baselines3, or damaged — {error}") from None
+        raise Damaged(f"{path}: not evaluations of Stable-Baselines3, or damaged — {error}") from None
 
 
 def read_scalars(folder: Path) -> dict[str, Scalar]:
@@ -158,7 +162,7 @@ def read_scalar_table(path: Path) -> dict[str, Scalar]:
 
     :param path: a ``scalars.csv``
     :return: name of each quantity → its course
-    :raises ValueError: if the file is something else
+    :raises Damaged: if the file is something else
     """
     try:
         with path.open(encoding="utf-8", newline="") as lines:
@@ -171,7 +175,7 @@ def read_scalar_table(path: Path) -> dict[str, Scalar]:
             scalars[tag] = Scalar(steps.astype(np.int64), seconds, values)
         return scalars
     except (ValueError, KeyError, TypeError, OSError) as error:
-        raise ValueError(f"{path}: no table of scalars, or damaged — {error}") from None
+        raise Damaged(f"{path}: no table of scalars, or damaged — {error}") from None
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -312,8 +316,8 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
     """
     Put runs together that differ in seed and length only.
 
-    Groups of the same algorithm and environment are told apart by up to two hyper-parameters that differ, else by the
-    names of their folders.
+    Groups of the same algorithm and environment are told apart by up to two hyper-parameters that differ, if their values
+    are short, else by the numbers of their folders.
 
     :param runs: any runs
     :return: groups in the order of their first runs
@@ -335,7 +339,7 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
         alike = [s for g, s in zip(groups, settings, strict=True) if (g.label, g.env) == (group.label, group.env)]
         keys = sorted({key for other in alike for key in {*setting, *other} if setting.get(key) != other.get(key)})
         label = group.label
-        if 0 < len(keys) <= 2:
+        if 0 < len(keys) <= 2 and all(len(other.get(key, "")) <= 24 for other in alike for key in keys):
             label += " " + ", ".join(f"{key.rpartition('.')[2]} {setting.get(key, 'default')}" for key in keys)
         elif keys:
             label += f" {', '.join(run.path.absolute().name.rpartition('_')[2] for run in group.runs)}"

@@ -29,7 +29,7 @@ from sb3_symphony.common.mirror import Mirror
 
 
 def _check_fading(fade_factor: float | None, fade_power: float) -> None:
-    if fade_factor is not None and not fade_factor > 0:  # written so that NaN is refused too
+    if fade_factor is not None and not (isinstance(fade_factor, int | float | np.number) and fade_factor > 0):  # NaN neither
         raise ValueError(f"fade_factor={fade_factor!r}: expected a number > 0, or None (or inf) for uniform sampling")
     check_number("fade_power", fade_power, 0, exclusive=True)
 

@@ -315,7 +315,7 @@ class QuietOnReturn(BaseCallback):
         noises: list[Any] = noise.noises if isinstance(noise, VectorizedActionNoise) else [noise]
         for each in noises:
             if not isinstance(each, StickyActionNoise):
-                raise TypeError(f"action_noise={each}: expected a StickyActionNoise")
+                raise TypeError(f"action_noise={each}: expected a StickyActionNoise, or no QuietOnReturn among the callbacks")
         return noises
 
     def _init_callback(self) -> None:

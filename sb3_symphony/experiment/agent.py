@@ -30,7 +30,7 @@ from sb3_symphony.experiment.environment import (
     vec_wrapped,
 )
 from sb3_symphony.experiment.registry import LOADABLE, load_algorithm
-from sb3_symphony.experiment.select import Selection, SelectOptions, pretrained_folder, select_model
+from sb3_symphony.experiment.select import Selection, SelectOptions, select_model
 
 
 class Step(NamedTuple):
@@ -220,7 +220,7 @@ def load_model(selection: Selection, device: str = "auto") -> BaseAlgorithm:
     """
     algorithm = load_algorithm(selection.algo)
     _check_archive(selection, algorithm)
-    if selection.run is None and not selection.model.resolve().is_relative_to(pretrained_folder().resolve()):
+    if selection.run is None and not selection.shipped:
         _tell_of_pickles()
     try:
         with warnings.catch_warnings():

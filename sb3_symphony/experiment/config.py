@@ -8,6 +8,7 @@ Stable-Baselines3.
 """
 
 import ast
+import difflib
 import re
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
@@ -298,6 +299,17 @@ class RunSettings(BaseModel):
     noise_std: Annotated[FiniteFloat, Field(ge=0)] | None = None
     stop_reward: FiniteFloat | None = None
 
+    def varied(self, env_kwargs: dict[str, Any], env_wrapper: list[tuple[str, dict[str, Any]]]) -> "RunSettings":
+        """
+        :param env_kwargs: arguments of the environment that go before these
+        :param env_wrapper: wrappers instead of those of the same names, else around them
+        :return: the settings with them
+        """
+        given = dict(env_wrapper)
+        wrappers = [(name, given.pop(name, arguments)) for name, arguments in self.env_wrapper]
+        update = {"env_kwargs": {**self.env_kwargs, **env_kwargs}, "env_wrapper": [*wrappers, *given.items()]}
+        return self.model_copy(update=update)
+
 
 @dataclass
 class RunConfig:
@@ -324,7 +336,8 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
+        # A key that is not known first: it may be the missing one, misspelt
+        first = min(error.errors(), key=lambda each: each["type"] != "extra_forbidden" or len(each["loc"]) > 1)
         key = str(first["loc"][0]) if first["loc"] else model.__name__
         if first["type"] == "missing":
             raise ConfigError(f"{key}: missing — expected in the configuration") from None
@@ -371,6 +384,10 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
         raise ConfigError(f"--conf-file: missing — expected settings for {options.algo}, such as the name of its parent, redq")
     if not path.exists():
         path = shipped_file(str(path)) or path
+    if not path.exists() and not path.suffix and len(path.parts) == 1:
+        presets = [file.stem for file in (*shipped_folder().glob("presets/*.yml"), *shipped_folder().glob("*.yml"))]
+        near = suggestion(path, presets) or f" — expected a YAML file or one of {', '.join(sorted(presets))}"
+        raise ConfigError(f"-conf: no such file or preset '{path}'{near}")
     content = read_yaml(path)
     for name in (options.env, "default"):
         if name in content:
@@ -410,6 +427,9 @@ def run_settings(content: dict[str, Any]) -> RunSettings:
     :raises ConfigError: if one of them is wrong
     """
     plain = {key: value for key, value in content.items() if key in RunSettings.model_fields and value is not None}
+    misspelt = [] if "n_timesteps" in plain else difflib.get_close_matches("n_timesteps", map(str, content), n=1)
+    if misspelt:
+        raise ConfigError(f"unknown hyper-parameter '{misspelt[0]}': did you mean 'n_timesteps'?")
     _read_expressions(plain)
     settings = validated(RunSettings, plain)
     if (settings.noise_type is None) != (settings.noise_std is None):

@@ -8,13 +8,15 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
+from functools import reduce
 from importlib import import_module
+from operator import or_
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import gymnasium as gym
 import numpy as np
-from pydantic import ConfigDict, PydanticSchemaGenerationError, TypeAdapter, ValidationError
+from pydantic import AfterValidator, ConfigDict, PydanticSchemaGenerationError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -75,6 +77,8 @@ _AT_LEAST_ONE = {
 }
 _FRACTION = {"actor_averaging", "dropout_rate", "gae_lambda", "gamma", "tau"}
 _ANY_SIGN = {"gradient_steps", "sde_sample_freq", "target_entropy"}
+#: what text may say where SB3 takes text and numbers, and tells it without the argument's name
+_WORDS = {"ent_coef": r"auto(_[0-9.eE+-]+)?", "target_entropy": "auto"}
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -100,6 +104,16 @@ def class_by_name(key: str, name: Any) -> Any:
     raise ConfigError(f"{key}: unknown class {name!r}{near}")
 
 
+def _alternatives(annotation: Any) -> tuple[Any, ...]:
+    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+
+
+def _plain(annotation: Any) -> Any:
+    """NumPy's numbers and arrays as what a YAML file has for them: numbers and lists."""
+    plain = {np.floating: float, np.integer: int, np.ndarray: float | Annotated[list[float], AfterValidator(np.array)]}
+    return reduce(or_, (plain.get(get_origin(each) or each, each) for each in _alternatives(annotation)))
+
+
 def argument_types(class_: type) -> dict[str, Any]:
     """
     :param class_: any class
@@ -114,7 +128,7 @@ def argument_types(class_: type) -> dict[str, Any]:
         for parameter in parameters:
             if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
                 annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
-                found.setdefault(parameter.name, annotation)
+                found.setdefault(parameter.name, _plain(annotation))
         if all(parameter.kind != parameter.VAR_KEYWORD for parameter in parameters):
             break
     return found
@@ -139,10 +153,6 @@ def check_keys(given: Iterable[str], known: Iterable[str], what: str, owner: str
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _alternatives(annotation: Any) -> tuple[Any, ...]:
-    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-
-
 def _describe(annotation: Any) -> str:
     """What an annotation allows, in words."""
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "a name", NoneType: "null"}
@@ -165,6 +175,8 @@ def _describe(annotation: Any) -> str:
             parts.append("the name of a class")
         elif origin is list:
             parts.append(f"[{_describe(get_args(alternative)[0])}, …]")
+        elif origin is Annotated:
+            parts.append(_describe(get_args(alternative)[0]))
         elif isinstance(alternative, type):
             parts.append(f"{{{alternative.__name__}: {{…}}}}")
     return " or ".join(dict.fromkeys(parts))
@@ -173,7 +185,7 @@ def _describe(annotation: Any) -> str:
 def _numbers(value: Any) -> Iterable[float]:
     if isinstance(value, int | float) and not isinstance(value, bool):
         yield value
-    elif isinstance(value, list | tuple):
+    elif isinstance(value, list | tuple | np.ndarray):
         for item in value:
             yield from _numbers(item)
     elif isinstance(value, Mapping):
@@ -269,11 +281,14 @@ def _action_noise(value: Any, n_actions: int, n_envs: int) -> Any:
     if "n_actions" in types:
         arguments = typed_arguments(arguments, class_, filled, lowest=0)
     else:  # SB3's own noises want one number per action
-        check_keys(arguments, types.keys() - {"self", *filled}, "argument", name)
-        _check_range("action_noise", value, {k: v for k, v in arguments.items() if k != "mean"}, 0)
-        arguments = {k: np.full(n_actions, v) if k in ("mean", "sigma") else v for k, v in {"mean": 0.0, **arguments}.items()}
+        check_keys(arguments, types.keys() - {"self", "dtype", *filled}, "argument", name)
+        for key, plain in {"mean": 0.0, **arguments}.items():
+            lowest = 0 if key != "mean" else -math.inf
+            arguments[key] = _typed(f"action_noise: {name}: {key}", plain, plain, types[key], lowest)
     arguments |= {key: filled[key] for key in filled if key in types}
     try:
+        if "n_actions" not in types:
+            arguments |= {key: np.full(n_actions, arguments[key]) for key in ("mean", "sigma") if key in arguments}
         return class_(**arguments)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"action_noise: {name}: {error}") from None
@@ -289,6 +304,31 @@ def _policy_kwargs(value: Any, policy_class: type) -> dict[str, Any]:
         item = _named_classes(key, plain) if key in _CLASSES and plain is not None else plain
         decoded[key] = _typed(key, plain, item, types[key], -math.inf)
     return decoded
+
+
+def _is_ours(algorithm: type[BaseAlgorithm]) -> bool:
+    """Symphony, REDQ and what is derived from them."""
+    return hasattr(algorithm, "default_buffers")
+
+
+def _check_words(decoded: Mapping[str, Any]) -> None:
+    """Text among the arguments of SB3's algorithms says what they can read; ours tell it themselves."""
+    for key, pattern in _WORDS.items():
+        value = decoded.get(key)
+        if isinstance(value, str) and not re.fullmatch(pattern, value):
+            raise ConfigError(f"{key}: {value!r} — expected a number or auto{' or auto_<number>' * (key == 'ent_coef')}")
+
+
+def _check_replay(name: str, algorithm: Any, decoded: Mapping[str, Any]) -> None:
+    """The replay buffer fits the algorithm, and its arguments the buffer."""
+    chosen, arguments = decoded.get("replay_buffer_class"), decoded.get("replay_buffer_kwargs")
+    if getattr(chosen, "__name__", "") == "PrioritizedReplayBuffer" and not _is_ours(algorithm):
+        raise ConfigError(f"replay_buffer_class: 'PrioritizedReplayBuffer' — {name} does not apply its importance weights")
+    classes = [chosen] if chosen is not None else algorithm.default_buffers if _is_ours(algorithm) else []
+    if arguments and classes:
+        known = {key for class_ in classes for key in argument_types(class_)}
+        owner = " or ".join(dict.fromkeys(class_.__name__ for class_ in classes))
+        check_keys(arguments, known, "replay_buffer_kwargs key", owner)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -344,11 +384,10 @@ def algorithm_arguments(
         elif _takes_schedule(types[key]):
             value = _schedule(key, value)
         decoded[key] = _typed(key, plain, value, types[key], 0)
-    buffer_class, buffer_kwargs = decoded.get("replay_buffer_class"), decoded.get("replay_buffer_kwargs")
-    if getattr(buffer_class, "__name__", "") == "PrioritizedReplayBuffer" and not algorithm.__module__.startswith(
-        "sb3_symphony."
-    ):
-        raise ConfigError(f"replay_buffer_class: 'PrioritizedReplayBuffer' — {name} does not apply its importance weights")
-    if buffer_class is not None and buffer_kwargs:
-        check_keys(buffer_kwargs, argument_types(buffer_class), "replay_buffer_kwargs key", buffer_class.__name__)
+    if not _is_ours(algorithm):
+        _check_words(decoded)
+    train_freq = decoded.get("train_freq")
+    if isinstance(train_freq, tuple) and train_freq[1] == "episode" and settings.n_envs > 1:
+        raise ConfigError(f"train_freq: {list(train_freq)!r} — expected steps where n_envs is {settings.n_envs}")
+    _check_replay(name, algorithm, decoded)
     return {"policy": settings.policy, **decoded}

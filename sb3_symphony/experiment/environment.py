@@ -192,6 +192,8 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
         raise ConfigError(f"environment '{env_id}' cannot be made — {error}") from None
     except (TypeError, ValueError, AssertionError, OSError) as error:
         raise ConfigError(f"environment '{env_id}' cannot be made with {env_kwargs} — {error}") from None
+    except Exception as error:  # whatever a user's own module or environment does
+        raise ConfigError(f"environment '{env_id}' cannot be made — {type(error).__name__}: {error}") from error
     registered = env.spec.id if env.spec is not None else env_id
     if registered != env_id.rpartition(":")[2]:  # Gymnasium takes the latest version; settings and folders go by the full id
         env.close()

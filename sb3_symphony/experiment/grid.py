@@ -28,12 +28,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.cell import Control, Job, Outcome, supervise
-from sb3_symphony.experiment.config import ConfigError, TrainOptions
+from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
 from sb3_symphony.experiment.grid_progress import Progress, standings
 from sb3_symphony.experiment.grid_report import collect, on_page, report
 from sb3_symphony.experiment.registry import is_file, without_folder
 from sb3_symphony.experiment.signals import handled_by
-from sb3_symphony.experiment.study import Study, found_by, read_study, sweep_options
+from sb3_symphony.experiment.study import Cell, Study, found_by, read_study, sweep_options
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.experiment.backends import Backend
@@ -149,8 +149,20 @@ def _check_models(progress: Sequence[Progress]) -> None:
             assert env is not None
             env.close()
             keep_protocol(cell.options, each.config)
+            for name, condition in cell.conditions.items():
+                _check_condition(name, condition, cell, each.config)
         except ConfigError as error:
             raise ConfigError(f"{cell.algorithm} on {cell.environment.id}: {error}") from None
+
+
+def _check_condition(name: str, condition: dict[str, Any], cell: Cell, config: RunConfig) -> None:
+    from sb3_symphony.experiment.environment import make_evaluation_env
+
+    settings = config.settings.varied(condition["env_kwargs"], condition["env_wrapper"])
+    try:
+        make_evaluation_env(cell.environment.id, settings).close()
+    except ConfigError as error:
+        raise ConfigError(f"condition '{name}': {error}") from None
 
 
 def _write_settings(progress: Sequence[Progress], folder: Path, study: Path) -> None:

@@ -126,18 +126,20 @@ def _default_output(options: PlotOptions, groups: "list[Group]") -> Path:
     return Path("" if options.runs else options.folder) / f"{names}_{options.kind}.png"
 
 
-def _lines(runs: "Iterable[Run]", line: "Callable[[Run], Line]", left_out: list[str]) -> "list[Line]":
-    """Lines of the runs that have recorded what is asked for; the others are told."""
-    from sb3_symphony.analysis.runs import NotRecorded
+def _lines(options: PlotOptions, runs: "Iterable[Run]", line: "Callable[[Run], Line]", left_out: list[str]) -> "list[Line]":
+    """Lines of the runs that have recorded what is asked for; the others, and damaged ones, are told."""
+    from sb3_symphony.analysis.runs import Damaged, NotRecorded
 
+    flags = {"--mean-per": options.mean_per, "-max": options.max_timesteps}
+    given = " and ".join(f"{flag} {value}" for flag, value in flags.items() if value is not None)
     lines = []
     for run in runs:
         try:
             x, y = line(run)
             if len(x) == 0:
-                raise NotRecorded(f"{run.path}: nothing to draw yet")
+                raise NotRecorded(f"{run.path}: nothing to draw {f'with {given}' if given else 'yet'}")
             lines.append((x, y))
-        except NotRecorded as error:
+        except (Damaged, NotRecorded) as error:
             left_out.append(str(error))
     return lines
 
@@ -164,7 +166,7 @@ def _curve_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, lis
     panels: dict[str, list[Curve]] = {}
     left_out: list[str] = []
     for group in groups:
-        lines = _lines(group.runs, line, left_out)
+        lines = _lines(options, group.runs, line, left_out)
         if lines:
             panels.setdefault(group.env, []).append(summarised(group.label, lines))
     return _told(panels, left_out)
@@ -191,6 +193,7 @@ def _scalar_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, li
     for tag in options.tags or [tag for tag in SCALARS if tag in logged] or sorted(logged):
         for group in groups:
             lines = _lines(
+                options,
                 [run for run in group.runs if tag in run.scalars],
                 lambda run, tag=tag: scalar_curve(run, tag, options.x_axis, options.max_timesteps),  # type: ignore[misc]
                 left_out,

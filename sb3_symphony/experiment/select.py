@@ -5,6 +5,7 @@ Only paths and YAML are read here, nothing heavy is imported; :mod:`sb3_symphony
 """
 
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,11 @@ class Selection:
     run: Path | None
     normalization_known: bool = True
 
+    @property
+    def shipped(self) -> bool:
+        """Whether it comes with the package, into which no command writes."""
+        return self.model.resolve().is_relative_to(pretrained_folder().resolve())
+
 
 def pretrained_folder() -> Path:
     """
@@ -102,8 +108,8 @@ def select_model(options: SelectOptions) -> Selection:
     Find a trained agent, and the environment that it belongs to.
 
     Without ``model``, it is looked for as RL Zoo does, in ``<folder>/<algo>/<env>_<exp-id>/``, and if the default folder
-    has no such run, among the agents that come with the package. What flags say about the environment goes before what
-    the run says.
+    has no such run and no certain model of it is wanted, among the agents that come with the package. What flags say about
+    the environment goes before what the run says.
 
     :param options: flags
     :return: the agent's files and environment
@@ -116,12 +122,7 @@ def select_model(options: SelectOptions) -> Selection:
 
 
 def _select(options: SelectOptions) -> Selection:
-    wanted = {
-        "--load-best": options.load_best,
-        "--load-checkpoint": options.load_checkpoint is not None,
-        "--load-last-checkpoint": options.load_last_checkpoint,
-    }
-    given = [flag for flag, value in wanted.items() if value]
+    given = _which_of_run(options)
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)}: expected only one of them")
     if options.algo is not None:
@@ -155,6 +156,16 @@ def _select(options: SelectOptions) -> Selection:
     return _selection(options, path, run)
 
 
+def _which_of_run(options: SelectOptions) -> list[str]:
+    """The flags given that choose among the models of a run."""
+    wanted = {
+        "--load-best": options.load_best,
+        "--load-checkpoint": options.load_checkpoint is not None,
+        "--load-last-checkpoint": options.load_last_checkpoint,
+    }
+    return [flag for flag, value in wanted.items() if value]
+
+
 def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Selection:
     trained = read_yaml(run.details / "args.yml") if run and (run.details / "args.yml").is_file() else {}
     algo, env_id = options.algo or trained.get("algo"), options.env or trained.get("env")
@@ -175,10 +186,8 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
     env_kwargs = {**(config.get("env_kwargs") or {}), **(trained.get("env_kwargs") or {})}
     if env_id != trained.get("env", env_id):
         env_kwargs = {}  # of another environment
-    settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": {**env_kwargs, **options.env_kwargs}})
-    given = dict(options.env_wrapper)
-    wrappers = [(name, given.pop(name, arguments)) for name, arguments in settings.env_wrapper]
-    settings = settings.model_copy(update={"env_wrapper": [*wrappers, *given.items()]})
+    settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": env_kwargs})
+    settings = settings.varied(options.env_kwargs, options.env_wrapper)
     normalization = _normalization(options, model, run, settings)
     known = run is not None or options.vecnormalize is not None
     return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None, known)
@@ -219,10 +228,12 @@ def _find_run(options: SelectOptions) -> RunFolder:
     env_name = RunFolder.file_name(env_id)
     folder = Path(options.folder)
     numbers = RunFolder.numbers(folder / algo, env_name)
-    if not numbers and options.folder == SelectOptions.model_fields["folder"].default:
+    if not numbers and options.folder == SelectOptions.model_fields["folder"].default and not _which_of_run(options):
         shipped = pretrained_folder()
         numbers = RunFolder.numbers(shipped / algo, env_name)
-        folder = shipped if numbers else folder
+        if numbers:
+            print(f"note: no such run in '{folder}', this is the agent that comes with the package", file=sys.stderr)
+            folder = shipped
     if not numbers:
         trained = sorted({path.name.rpartition("_")[0] for path in (folder / algo).glob("*_*") if path.is_dir()})
         near = suggestion(env_name, trained) or (f" — there are runs of {', '.join(trained)}" if trained else "")

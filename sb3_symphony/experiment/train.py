@@ -83,7 +83,8 @@ class TrainResult:
     def summary(self) -> str:
         """:return: one line for the end of a run"""
         if self.untouched:
-            return f"{self.run.path} is finished: {self.steps} steps — nothing changed (a larger -n goes on)"
+            onward = " (a larger -n goes on)" if any(self.run.checkpoints.glob("*.ckpt")) else ""
+            return f"{self.run.path} is finished: {self.steps} steps — nothing changed{onward}"
         evaluated = "not evaluated"
         if self.evaluation:
             mean, spread = np.mean(self.evaluation), np.std(self.evaluation)

@@ -354,10 +354,12 @@ def _write_gif(pictures: Iterable[np.ndarray], fps: float, output: Path) -> int:
 
 
 def _default_output(options: VideoOptions, agents: Sequence[Shown]) -> Path:
-    """In the run's folder, as RL Zoo has it; that of a grid in the working folder."""
+    """In the run's folder, as RL Zoo has it; that of a grid, or of an agent of the package, in the working folder."""
     selection = agents[0].agent.selection
     if options.grid and len(agents) > 1:
         return Path(f"{selection.env_id.rpartition(':')[2].replace('/', '-')}_grid.mp4")
+    if selection.shipped:
+        return Path(f"{selection.algo}_{selection.model.stem}.mp4")
     if selection.run is None:
         return selection.model.with_suffix(".mp4")
     return output_folder(selection.run / "videos", "video") / f"{selection.model.stem}.mp4"
