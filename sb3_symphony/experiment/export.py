@@ -21,7 +21,7 @@ from sb3_symphony.experiment.select import ExportOptions
 
 #: observations that the file is checked on
 N_OBSERVATIONS = 1000
-#: largest difference of an action, as a share of half its range
+#: largest difference of an action, as a share of half its range or, where that is less, of 1
 TOLERANCE = 1e-5
 
 
