@@ -28,7 +28,7 @@ from sb3_symphony.experiment.config import (
     shipped_folder,
     validated,
 )
-from sb3_symphony.experiment.decode import algorithm_arguments, argument_types, class_by_name
+from sb3_symphony.experiment.decode import algorithm_arguments, argument_types, class_by_name, typed_arguments
 from sb3_symphony.experiment.environment import find_wrapper, split_wrappers
 from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
 
@@ -257,6 +257,16 @@ def test_arrays_of_wrappers(limit):
     np.testing.assert_array_equal(env.action_space.low, np.broadcast_to(limit, env.action_space.shape))
     with pytest.raises(ConfigError, match=r"RescaleAction: min_action: 'low' — expected a number or \[a number, …\]"):
         split_wrappers([("gymnasium.wrappers.RescaleAction", {"min_action": "low", "max_action": 1})])
+
+
+def test_annotations_that_are_none():
+    """A user's own class may annotate its arguments with anything."""
+
+    class Odd:
+        def __init__(self, x: [int], y: "3" = 3):
+            pass
+
+    assert typed_arguments({"x": 1, "y": "a"}, Odd, []) == {"x": 1, "y": "a"}
 
 
 def test_suggestions():

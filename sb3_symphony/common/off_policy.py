@@ -152,7 +152,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
             if not self._was_set_up:
                 raise
             # Loaded on another kind of machine, maybe only to act
-            warnings.warn(f"{error}. Should the loaded model be trained, it is with 'auto'", stacklevel=2)
+            warnings.warn(f"{error}. The loaded model goes on with 'auto'", stacklevel=2)
             self._regression = make_regression(*parts, "auto")
 
     def _create_aliases(self) -> None:

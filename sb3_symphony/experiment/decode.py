@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import reduce
 from importlib import import_module
-from operator import or_
+from operator import is_, or_
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -77,6 +77,12 @@ _AT_LEAST_ONE = {
 }
 _FRACTION = {"actor_averaging", "dropout_rate", "gae_lambda", "gamma", "tau"}
 _ANY_SIGN = {"gradient_steps", "sde_sample_freq", "target_entropy"}
+#: NumPy's types in annotations, and the plain ones instead
+_NUMPY: list[tuple[type, Any]] = [
+    (np.floating, float),
+    (np.integer, int),
+    (np.ndarray, float | Annotated[list[float], AfterValidator(np.array)]),
+]
 #: what text may say where SB3 takes text and numbers, and tells it without the argument's name
 _WORDS = {"ent_coef": r"auto(_[0-9.eE+-]+)?", "target_entropy": "auto"}
 
@@ -110,8 +116,9 @@ def _alternatives(annotation: Any) -> tuple[Any, ...]:
 
 def _plain(annotation: Any) -> Any:
     """NumPy's numbers and arrays as what a YAML file has for them: numbers and lists."""
-    plain = {np.floating: float, np.integer: int, np.ndarray: float | Annotated[list[float], AfterValidator(np.array)]}
-    return reduce(or_, (plain.get(get_origin(each) or each, each) for each in _alternatives(annotation)))
+    given = _alternatives(annotation)
+    plain = [next((yaml for numpy, yaml in _NUMPY if (get_origin(each) or each) is numpy), each) for each in given]
+    return annotation if all(map(is_, given, plain)) else reduce(or_, plain)
 
 
 def argument_types(class_: type) -> dict[str, Any]:
@@ -160,7 +167,7 @@ def _describe(annotation: Any) -> str:
     alternatives = _alternatives(annotation)
     for alternative in alternatives:
         origin = get_origin(alternative)
-        if alternative in words:
+        if isinstance(alternative, type) and alternative in words:
             if not (alternative is int and float in alternatives):
                 parts.append(words[alternative])
         elif Callable in (origin, alternative):

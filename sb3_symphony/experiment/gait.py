@@ -202,8 +202,8 @@ def gait(options: GaitOptions) -> list[Gait]:
     with report(options.json_file) as tell, ExitStack() as cleanup:
         agents = show_agents(options, cleanup, WalkerSensors)
         selection = agents[0].agent.selection
-        own = selection.run is not None and not selection.shipped and len(agents) == 1
-        default = (selection.run if own and selection.run else Path()) / "gait.png"
+        run = None if selection.shipped else selection.run
+        default = run / "gait.png" if run is not None and len(agents) == 1 else Path("gait.png")
         output = output_file(options.output or default, "--output", SUFFIXES)
         gaits = [record_gait(shown, options) for shown in agents]
         try:
