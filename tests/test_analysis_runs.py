@@ -35,11 +35,12 @@ def make_run(folder, algo="sac", env="X-v0", seed=0, number=1, **config):
 # ---------------------------------------------------------------- files
 
 
-def test_parallel_environments_are_merged_by_time(tmp_path):
+def test_parallel_environments_step_together(tmp_path):
+    """When one of two has taken 10 steps, so has the other, whose episode goes on."""
     write_monitor(tmp_path / "0.monitor.csv", 100.0, [(1.0, 10, 1.0), (3.0, 20, 5.0)])
     write_monitor(tmp_path / "1.monitor.csv", 101.0, [(2.0, 15, 1.5)])
     episodes = read_episodes(tmp_path)
-    np.testing.assert_array_equal(episodes.steps, [10, 25, 45])
+    np.testing.assert_array_equal(episodes.steps, [20, 30, 60])
     np.testing.assert_array_equal(episodes.returns, [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(episodes.lengths, [10, 15, 20])
     np.testing.assert_array_equal(episodes.seconds, [1.0, 2.5, 5.0])

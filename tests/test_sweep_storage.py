@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import optuna
 import pytest
@@ -17,7 +18,15 @@ from sqlalchemy.exc import ArgumentError, OperationalError, PendingRollbackError
 from tune_helpers import kill
 
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.sweep_storage import GRACE, WORKER, Patience, StorageAway, SweepStorage, open_storage
+from sb3_symphony.experiment.sweep_storage import (
+    GRACE,
+    WORKER,
+    Patience,
+    StorageAway,
+    SweepStorage,
+    _JournalFile,
+    open_storage,
+)
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -348,3 +357,24 @@ def test_what_is_wrong_in_itself_is_not_waited_for():
 
     with pytest.raises(StorageInternalError):
         Patience("storage", 10, never)(read)
+
+
+def test_a_record_that_fits_in_parts(small_disk):
+    """Nothing of it is in the journal before there is room for the whole."""
+    path, filler = small_disk / "journal.log", small_disk / "filler"
+    first = b'"' + b"x" * 4087 + b'"\n'  # six bytes are left of its block
+    path.write_bytes(first)
+    with filler.open("wb", buffering=0) as file:
+        with suppress(OSError):
+            while file.write(bytes(4096)):
+                pass
+        file.truncate(file.tell() - 4096)
+
+    def make_room() -> None:
+        assert path.read_bytes() == first
+        filler.unlink(missing_ok=True)
+
+    journal = _JournalFile(path, Patience("journal", 10.0, make_room))
+    journal.append_logs([{"long": "y" * 6000}])
+    journal.append_logs([{"short": 1}])
+    assert list(journal.read_logs(1)) == [{"long": "y" * 6000}, {"short": 1}]

@@ -85,18 +85,21 @@ def read_episodes(folder: Path) -> Episodes | None:
     if not paths:
         return None
     starts: list[float] = []
-    rows: list[tuple[float, float, int, float]] = []  # time of the end, return, length, success
+    rows: list[tuple[int, float, float, int, float]] = []  # step and time of the end, return, length, success
     for path in paths:
         try:
             with path.open(encoding="utf-8", newline="") as lines:
                 starts.append(float(json.loads(lines.readline().removeprefix("#"))["t_start"]))
-                rows += _monitor_rows(csv.DictReader(lines), starts[-1])
+                step = 0
+                for row in _monitor_rows(csv.DictReader(lines), starts[-1]):
+                    step += row[2] * len(paths)  # all copies of the environment step together
+                    rows.append((step, *row))
         except (ValueError, KeyError, TypeError, OSError) as error:
             raise Damaged(f"{path}: not a monitor file of Stable-Baselines3, or damaged — {error}") from None
-    rows.sort(key=lambda row: row[0])
-    ends, returns, lengths, successes = np.array(rows, dtype=float).reshape(-1, 4).T
+    rows.sort(key=lambda row: row[:2])
+    steps, ends, returns, lengths, successes = np.array(rows, dtype=float).reshape(-1, 5).T
     return Episodes(
-        steps=np.cumsum(lengths).astype(np.int64),
+        steps=steps.astype(np.int64),
         seconds=ends - min(starts),
         returns=returns,
         lengths=lengths.astype(np.int64),

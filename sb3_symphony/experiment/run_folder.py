@@ -7,6 +7,7 @@ from typing import Any
 
 import yaml
 
+from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError
 
 
@@ -134,6 +135,4 @@ class RunFolder:
         contents = {"config.yml": yaml.safe_dump(config, sort_keys=False), "command.txt": command + "\n"}
         contents["args.yml"] = yaml.safe_dump(options, sort_keys=False)  # the last one: a folder that has it is complete
         for name, content in contents.items():
-            temporary = self.details / f".{name}.tmp"
-            temporary.write_text(content, encoding="utf-8")
-            temporary.replace(self.details / name)
+            write_atomically(self.details / name, content.encode())

@@ -135,13 +135,15 @@ class _JournalFile(JournalFileBackend):
         self._patience(partial(self._append, content.encode()))
 
     def _append(self, content: bytes) -> None:
-        with self._write_lock, open(self._path, "r+b") as file:  # not "a": a journal that is gone is not begun anew
+        # Not "a": a journal that is gone is not begun anew. Unbuffered: what did not fit is not written when it is closed
+        with self._write_lock, open(self._path, "r+b", buffering=0) as file:
             end = _end_of_last_line(file)
             file.seek(end)
             file.truncate()
             try:
-                file.write(content)
-                file.flush()
+                left = memoryview(content)
+                while left:
+                    left = left[file.write(left) :]
                 os.fsync(file.fileno())
             except OSError:
                 with suppress(OSError):
