@@ -8,6 +8,7 @@ are back, or patience has run out. Both tell the trials of processes that live f
 import json
 import os
 import socket
+import threading
 import time
 import uuid
 import warnings
@@ -196,6 +197,7 @@ class JournalSweep:
         self.patience = Patience(self.name, PATIENCE * heartbeat, stopping)
         self._lock = FileLock(f"{path}.claim.lock")
         self._alive: FileLock | None = None
+        self._beating = threading.Lock()
         _check_journal(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -220,9 +222,10 @@ class JournalSweep:
 
         :param trial_ids: trials that it runs
         """
-        if self._alive is None:
-            self._alive = FileLock(self._sign(self.worker))
-            self._alive.acquire()
+        with self._beating:  # a claim and the thread that shows life may both be the first
+            if self._alive is None:
+                self._alive = FileLock(self._sign(self.worker), thread_local=False)
+                self._alive.acquire()
 
     def bury(self, study: optuna.Study) -> None:
         """

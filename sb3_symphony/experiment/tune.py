@@ -185,7 +185,6 @@ class Sweep:
         :raises StorageAway: if the storage was away for too long
         :raises ProgramError: if a training ended in a mistake of the program
         """
-        self.storage.beat([])  # makes its sign of life, before thread and claims could both do so
         ended = threading.Event()
         threading.Thread(target=self._beat, args=(ended,), daemon=True).start()
         try:
