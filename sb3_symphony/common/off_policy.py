@@ -47,6 +47,7 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
     """
 
     policy: Any  # SymphonyPolicy or REDQPolicy
+    actor: Any  # of that policy
     critic: EnsembleCritic
     critic_target: EnsembleCritic
     # Buffers used without ``replay_buffer_class``: for Dict observations, for n-step returns, otherwise
@@ -211,6 +212,12 @@ class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
                 yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
             gradient_steps -= draw
+
+    def _step_actor(self, loss: th.Tensor) -> None:
+        """One step of the actor. No gradient reaches the critics, nor what is frozen."""
+        self.actor.optimizer.zero_grad()
+        loss.backward(inputs=[parameter for parameter in self.actor.parameters() if parameter.requires_grad])
+        self.actor.optimizer.step()
 
     def _update_priorities(self, batch: ReplayBufferSamples, target: th.Tensor, q_values: th.Tensor) -> None:
         """Priority of a transition: its error averaged over the critics. Nothing to do for other buffers."""

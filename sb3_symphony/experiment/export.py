@@ -100,10 +100,7 @@ def export(options: ExportOptions) -> Export:
         raise ConfigError(message) from None
     check_device(options.device)  # though tracing goes on on the CPU
     with open_agent(options.model_copy(update={"device": "cpu"})) as agent:
-        default = agent.selection.model.with_suffix(".onnx")
-        if agent.selection.shipped:
-            default = Path(f"{agent.selection.algo}_{default.name}")
-        path = output_file(options.output or default, "--output", (".onnx",))
+        path = output_file(options.output or agent.selection.beside(".onnx"), "--output", (".onnx",))
         _check_exportable(agent)
         content = onnx_model(agent.model, unwrap_vec_normalize(agent.env), _properties(agent))
         difference = _difference(content, agent)

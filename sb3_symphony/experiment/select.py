@@ -95,6 +95,13 @@ class Selection:
         """Whether it comes with the package, into which no command writes."""
         return self.model.resolve().is_relative_to(pretrained_folder().resolve())
 
+    def beside(self, suffix: str) -> Path:
+        """
+        :param suffix: such as ``.onnx``
+        :return: a file beside the model, or in the working folder if the model comes with the package
+        """
+        return Path(f"{self.algo}_{self.model.stem}{suffix}") if self.shipped else self.model.with_suffix(suffix)
+
 
 def pretrained_folder() -> Path:
     """

@@ -358,10 +358,8 @@ def _default_output(options: VideoOptions, agents: Sequence[Shown]) -> Path:
     selection = agents[0].agent.selection
     if options.grid and len(agents) > 1:
         return Path(f"{selection.env_id.rpartition(':')[2].replace('/', '-')}_grid.mp4")
-    if selection.shipped:
-        return Path(f"{selection.algo}_{selection.model.stem}.mp4")
-    if selection.run is None:
-        return selection.model.with_suffix(".mp4")
+    if selection.run is None or selection.shipped:
+        return selection.beside(".mp4")
     return output_folder(selection.run / "videos", "video") / f"{selection.model.stem}.mp4"
 
 

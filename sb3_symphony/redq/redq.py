@@ -252,9 +252,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         actions, log_prob = self.actor.action_log_prob(batch.observations)
         log_prob = log_prob.reshape(-1, 1)
         actor_loss = (ent_coef * log_prob - self._regression.q_values(batch.observations, actions).mean(dim=0)).mean()
-        self.actor.optimizer.zero_grad()
-        actor_loss.backward(inputs=[each for each in self.actor.parameters() if each.requires_grad])  # not the critics
-        self.actor.optimizer.step()
+        self._step_actor(actor_loss)
         logs["actor_loss"].append(actor_loss.detach())
         logs["ent_coef"].append(ent_coef.mean())
 

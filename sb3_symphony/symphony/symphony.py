@@ -264,9 +264,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         if self.saturation_penalty > 0:
             excess = F.relu(before_tanh.abs() - SATURATED)  # (batch, n_actions)
             actor_loss = actor_loss + self.saturation_penalty * excess.square().sum(dim=1).mean()
-        self.actor.optimizer.zero_grad()
-        actor_loss.backward(inputs=[each for each in self.actor.parameters() if each.requires_grad])  # not the critics
-        self.actor.optimizer.step()
+        self._step_actor(actor_loss)
 
         value = q_values.detach().mean()
         logs["actor_loss"].append(actor_loss.detach())

@@ -80,9 +80,7 @@ class SymphonyV2(Symphony):
 
         terms = self.actor_terms(batch)
         actor_loss = -sum(rehae(values, baseline) for values, baseline in terms)
-        self.actor.optimizer.zero_grad()
-        actor_loss.backward(inputs=list(self.actor.parameters()))  # no gradient reaches the critics
-        self.actor.optimizer.step()
+        self._step_actor(actor_loss)
         for (values, _), own in zip(terms[:2], (self.baseline, self.variance_baseline), strict=True):
             own.copy_(values.detach().mean())
         logs["actor_loss"].append(actor_loss.detach())
