@@ -485,25 +485,25 @@ def test_monitor_and_evaluations_are_what_they_were(killed):
     assert_same_results(whole, run)
 
 
-def fail_to_write(monkeypatch, fails):
-    """``fails(calls)``: which synchronisations of a file meet a full disk."""
-    fsync, calls = os.fsync, []
+def fill_disk_at(monkeypatch, name):
+    """From the first synchronisation of a file with ``name`` in its path on, the disk is full."""
+    fsync, failed = os.fsync, []
 
     def full(descriptor):
-        calls.append(descriptor)
-        if fails(len(calls)):
+        path = os.readlink(f"/proc/self/fd/{descriptor}")
+        if failed or name in path:
+            failed.append(path)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", full)
 
 
-@pytest.mark.parametrize("failing", [6, 8, 10])
-def test_no_room_for_a_checkpoint(monkeypatch, killed, capsys, failing):
-    """Each checkpoint synchronises a segment, the folder, all models, a state, the folder; in the second one, one fails."""
+@pytest.mark.parametrize("name", ["000000200.segment", "rl_model_200_steps.zip", "checkpoint_000000200.ckpt"])
+def test_no_room_for_a_checkpoint(monkeypatch, killed, capsys, name):
     whole = train(options(log_folder="a")).run.path
     with monkeypatch.context() as patched:
-        fail_to_write(patched, lambda call: call == failing)
+        fill_disk_at(patched, name)
         run = killed(230, options(log_folder="b"))
     out = capsys.readouterr().out
     assert "no checkpoint at 200 steps: No space left on device — training goes on, older ones are unharmed" in out
@@ -519,7 +519,7 @@ def test_no_room_at_the_end(monkeypatch, capsys):
     argv = "train --algo td3 --env Pendulum-v1 -n 260 --seed 1 --eval-freq 0 --verbose 0 --num-threads 1 --save-freq 100 -f b"
     small = ["-params", "learning_starts:50", "buffer_size:1000", "batch_size:16", "policy_kwargs.net_arch:[8]"]
     with monkeypatch.context() as patched:
-        fail_to_write(patched, lambda call: call > 11)
+        fill_disk_at(patched, "/.Pendulum-v1.zip.")
         assert main([*argv.split(), *small]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "No space left on device — once there is room, --resume goes on" in error
