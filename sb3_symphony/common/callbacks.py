@@ -13,7 +13,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, unwrap_vec_normalize
 
 from sb3_symphony.common.checks import check_number, check_pair
@@ -275,7 +276,44 @@ class QBiasCallback(BaseCallback):
         return True
 
 
-class QuietOnReturn(BaseCallback):
+class _OnReturn(BaseCallback):
+    """
+    Something that depends on the mean return of recent training episodes. These are kept in the model and saved with it: a
+    resumed training goes on alike.
+
+    :param returns: mean returns between which it changes, in the environment's units
+    :param n_episodes: how many episodes are recent
+    :param verbose: see SB3
+    :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
+        episodes (``stats_window_size``)
+    """
+
+    def __init__(self, returns: tuple[float, float], n_episodes: int, verbose: int) -> None:
+        super().__init__(verbose)
+        check_pair("returns", returns, "where the change begins, where it ends")
+        if not returns[0] < returns[1]:
+            raise ValueError(f"returns={returns!r}: expected the smaller number first")
+        check_number("n_episodes", n_episodes, 1, integer=True)
+        self.returns = returns
+        self.n_episodes = n_episodes
+
+    def _init_callback(self) -> None:
+        kept = self.model._stats_window_size
+        if self.n_episodes > kept:
+            raise ValueError(f"n_episodes={self.n_episodes!r}: expected at most the model's stats_window_size, {kept}")
+
+    def _on_step(self) -> bool:
+        episodes = self.model.ep_info_buffer
+        if episodes is not None and len(episodes) >= self.n_episodes:
+            self._follow(float(np.mean([episodes[-k]["r"] for k in range(1, self.n_episodes + 1)])))
+        return True
+
+    def _follow(self, recent: float) -> None:
+        """What depends on the mean return."""
+        raise NotImplementedError
+
+
+class QuietOnReturn(_OnReturn):
     """
     Sets the independent part of :class:`~sb3_symphony.common.noise.StickyActionNoise` by what training episodes return:
     who does not walk yet needs more of it than who does, whenever that is.
@@ -300,15 +338,9 @@ class QuietOnReturn(BaseCallback):
         n_episodes: int = 5,
         verbose: int = 0,
     ) -> None:
-        super().__init__(verbose)
-        check_pair("returns", returns, "where noise begins to fall, where it has fallen")
+        super().__init__(returns, n_episodes, verbose)
         check_pair("independent", independent, "before, after", 0)
-        if not returns[0] < returns[1]:
-            raise ValueError(f"returns={returns!r}: expected the smaller number first")
-        check_number("n_episodes", n_episodes, 1, integer=True)
-        self.returns = returns
         self.independent = independent
-        self.n_episodes = n_episodes
 
     def _noises(self) -> list[StickyActionNoise]:
         noise: Any = getattr(self.model, "action_noise", None)
@@ -319,15 +351,56 @@ class QuietOnReturn(BaseCallback):
         return noises
 
     def _init_callback(self) -> None:
+        super()._init_callback()
         self._noises()
-        kept = self.model._stats_window_size
-        if self.n_episodes > kept:
-            raise ValueError(f"n_episodes={self.n_episodes!r}: expected at most the model's stats_window_size, {kept}")
 
-    def _on_step(self) -> bool:
-        episodes = self.model.ep_info_buffer
-        if episodes is not None and len(episodes) >= self.n_episodes:
-            recent = np.mean([episodes[-k]["r"] for k in range(1, self.n_episodes + 1)])
-            for noise in self._noises():
-                noise.independent = float(np.interp(recent, self.returns, self.independent))
-        return True
+    def _follow(self, recent: float) -> None:
+        for noise in self._noises():
+            noise.independent = float(np.interp(recent, self.returns, self.independent))
+
+
+class _ScaledSchedule:
+    """A learning rate's schedule times a factor."""
+
+    def __init__(self, schedule: Schedule, factor: float) -> None:
+        self.schedule = schedule
+        self.factor = factor
+
+    def __call__(self, progress_remaining: float) -> float:
+        return self.factor * self.schedule(progress_remaining)
+
+
+class SlowOnReturn(_OnReturn):
+    """
+    Scales an algorithm's learning rates by what training episodes return: large ones find a gait soon, small ones keep who
+    has one on its feet, whenever that is.
+
+    All rates are scaled alike, each from what the model was given (a number or a schedule); between the two returns the
+    factor is interpolated geometrically. Any algorithm of SB3, SB3-Contrib and this package can be slowed.
+
+    :param returns: mean return of recent training episodes at which rates begin to fall, and at which they have fallen, in
+        the environment's units
+    :param factors: what rates are multiplied with there, > 0
+    :param n_episodes: how many episodes are recent; before there are as many, rates are left as they are
+    :param verbose: see SB3
+    :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
+        episodes (``stats_window_size``)
+    """
+
+    def __init__(
+        self,
+        returns: tuple[float, float],
+        factors: tuple[float, float] = (1.0, 0.2),
+        n_episodes: int = 5,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(returns, n_episodes, verbose)
+        check_pair("factors", factors, "before, after", 0, exclusive=True)
+        self.factors = factors
+
+    def _follow(self, recent: float) -> None:
+        factor = float(np.exp(np.interp(recent, self.returns, np.log(self.factors))))
+        self.model._setup_lr_schedule()  # as they were given
+        for name in ("lr_schedule", "critic_lr_schedule"):  # Symphony's critics have their own
+            if hasattr(self.model, name):
+                setattr(self.model, name, FloatSchedule(_ScaledSchedule(getattr(self.model, name), factor)))

@@ -35,7 +35,13 @@ def check_number(
 
 
 def check_pair(
-    name: str, value: Any, parts: str, low: float = -math.inf, high: float = math.inf, integer: bool = False
+    name: str,
+    value: Any,
+    parts: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    integer: bool = False,
+    exclusive: bool = False,
 ) -> None:
     """
     Refuse anything but two finite numbers in ``[low, high]``.
@@ -46,13 +52,14 @@ def check_pair(
     :param low: Smallest value allowed
     :param high: Largest value allowed
     :param integer: Whether only whole numbers are allowed
+    :param exclusive: Whether ``low`` itself is refused
     :raises TypeError: if one of the two is no number (of the kind asked for)
     :raises ValueError: if there are not two, or one is not finite or out of range
     """
     if not isinstance(value, (tuple, list)) or len(value) != 2:
         raise ValueError(f"{name}={value!r}: expected two numbers ({parts})")
     for number in value:
-        check_number(name, number, low, high, integer)
+        check_number(name, number, low, high, integer, exclusive)
 
 
 def check_choice(name: str, value: Any, options: Iterable[Any]) -> None:

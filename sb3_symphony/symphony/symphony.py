@@ -193,10 +193,13 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             self.action_noise = DecayingNormalActionNoise(self.action_space.shape)
         super()._setup_model()
         self._set_mixes()
-        rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
-        self.critic_lr_schedule = FloatSchedule(rate)
         # Mean value at the previous update, which the actor's loss compares with
         self.baseline = th.zeros((), device=self.device)
+
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        rate = self.learning_rate if self.critic_learning_rate is None else self.critic_learning_rate
+        self.critic_lr_schedule = FloatSchedule(rate)
 
     def train(self, gradient_steps: int, batch_size: int | None = None) -> None:
         # Switch to train mode (this affects dropout)

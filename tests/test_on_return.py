@@ -1,4 +1,4 @@
-"""Noise that follows the returns of training episodes."""
+"""Noise and learning rates that follow the returns of training episodes."""
 
 import gymnasium as gym
 import numpy as np
@@ -8,7 +8,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
-from sb3_symphony.common.callbacks import QuietOnReturn
+from sb3_symphony import REDQ, Symphony
+from sb3_symphony.common.callbacks import QuietOnReturn, SlowOnReturn
 from sb3_symphony.common.noise import StickyActionNoise
 from sb3_symphony.common.wrappers import RewardScale
 
@@ -42,6 +43,20 @@ class Note(BaseCallback):
     def _on_step(self):
         noise = self.model.action_noise
         self.seen.append([each.independent for each in getattr(noise, "noises", [noise])])
+        return True
+
+
+class NoteRates(BaseCallback):
+    """The learning rates of the optimizers after each step's update."""
+
+    def _init_callback(self):
+        self.seen = []
+
+    def _on_rollout_start(self):
+        optimizers = [self.model.actor.optimizer, self.model.critic.optimizer, getattr(self.model, "ent_coef_optimizer", None)]
+        self.seen.append([each.param_groups[0]["lr"] for each in optimizers if each is not None])
+
+    def _on_step(self):
         return True
 
 
@@ -90,19 +105,83 @@ def test_goes_on_alike_from_a_file(tmp_path):
     assert rest.seen == whole.seen[8:]
 
 
+SMALL = dict(learning_starts=1, batch_size=2, policy_kwargs=dict(net_arch=[4]), buffer_size=100, seed=0, device="cpu")
+SYMPHONY = dict(SMALL, gradient_steps=1, initial_gradient_steps=(0, 0), episode_gradient_steps=0)
+
+
+def factors(before=1.0, after=0.2):
+    """What rates are multiplied with after 1, 2, … episodes: geometric between the two."""
+    shares = np.clip((np.array(RETURNS) - 50) / 200, 0, 1)
+    return before ** (1 - shares) * after**shares
+
+
+@pytest.mark.parametrize(
+    "make, rates",
+    [
+        (lambda: Symphony("MlpPolicy", Returns(), learning_rate=1e-3, critic_learning_rate=2e-3, **SYMPHONY), [1e-3, 2e-3]),
+        (lambda: Symphony("MlpPolicy", Returns(), learning_rate=1e-3, critic_learning_rate=None, **SYMPHONY), [1e-3, 1e-3]),
+        (lambda: REDQ("MlpPolicy", Returns(), learning_rate=1e-3, gradient_steps=1, **SMALL), [1e-3] * 3),
+        (lambda: TD3("MlpPolicy", Returns(), learning_rate=1e-3, policy_delay=1, **SMALL), [1e-3] * 2),
+    ],
+    ids=["symphony", "symphony, one rate", "redq", "td3"],
+)
+@pytest.mark.parametrize("of_factors", [(1.0, 0.2), (2.0, 0.5)])
+def test_rates_follow_the_reported_returns(make, rates, of_factors):
+    note = NoteRates()
+    make().learn(17, callback=[SlowOnReturn((50, 250), of_factors, n_episodes=1), note])
+    # SB3 notes an episode after the callback of its last step: rates are those after the step behind it
+    after_episodes = np.array(note.seen[3::2])
+    assert after_episodes == pytest.approx(np.outer(factors(*of_factors), rates)[: len(after_episodes)])
+    assert len(after_episodes) == 7 and note.seen[2] == pytest.approx(rates)
+
+
+def test_a_schedule_goes_on_falling():
+    note = NoteRates()
+    td3_ = TD3("MlpPolicy", Returns(), learning_rate=lambda remaining: 1e-3 * remaining, policy_delay=1, **SMALL)
+    td3_.learn(16, callback=[SlowOnReturn((50, 250), n_episodes=1), note])
+    steps = np.arange(3, 16, 2)  # the second half of an episode is 2, 4, … steps after the start
+    expected_rates = factors()[: len(steps)] * 1e-3 * (1 - steps / 16)
+    assert [seen[0] for seen in note.seen[3::2]] == pytest.approx(expected_rates)
+
+
+def test_rates_go_on_alike_from_a_file(tmp_path):
+    def model(env):
+        return Symphony("MlpPolicy", env, learning_rate=1e-3, critic_learning_rate=2e-3, **SYMPHONY)
+
+    whole, rest = NoteRates(), NoteRates()
+    model(Returns()).learn(16, callback=[SlowOnReturn((50, 250), n_episodes=3), whole])
+    env = Returns()
+    half = model(env).learn(8, callback=SlowOnReturn((50, 250), n_episodes=3))
+    half.save(tmp_path / "half")
+    half.save_replay_buffer(tmp_path / "buffer")
+    loaded = Symphony.load(tmp_path / "half", env=env, device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    env.episode -= 1  # learn() resets the environment once more
+    loaded.learn(8, callback=[SlowOnReturn((50, 250), n_episodes=3), rest], reset_num_timesteps=False)
+    assert rest.seen == whole.seen[8:] and len(rest.seen) == 8
+    assert len({critic for _, critic in rest.seen}) > 2
+
+
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn])
 @pytest.mark.parametrize(
     "arguments, message",
     [
         (dict(returns=(100,)), r"returns=\(100,\): expected two numbers"),
         (dict(returns=(250, 100)), r"returns=\(250, 100\): expected the smaller number first"),
         (dict(returns=(0, float("nan"))), "returns=nan"),
-        (dict(returns=(0, 1), independent=(0.2, -0.1)), "independent=-0.1: expected a number >= 0"),
         (dict(returns=(0, 1), n_episodes=0), "n_episodes=0: expected an integer >= 1"),
     ],
 )
-def test_wrong_values(arguments, message):
+def test_wrong_values(callback, arguments, message):
     with pytest.raises(ValueError, match=message):
-        QuietOnReturn(**arguments)
+        callback(**arguments)
+
+
+def test_wrong_values_of_their_own():
+    with pytest.raises(ValueError, match=r"independent=-0\.1: expected a number >= 0"):
+        QuietOnReturn((0, 1), independent=(0.2, -0.1))
+    with pytest.raises(ValueError, match="factors=0: expected a number > 0"):
+        SlowOnReturn((0, 1), factors=(1, 0))
 
 
 def test_refuses_other_noise():
@@ -112,6 +191,7 @@ def test_refuses_other_noise():
             other.learn(3, callback=QuietOnReturn((0, 1)))
 
 
-def test_more_episodes_than_are_kept():
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn])
+def test_more_episodes_than_are_kept(callback):
     with pytest.raises(ValueError, match="n_episodes=5: expected at most the model's stats_window_size, 3"):
-        td3(Returns(), stats_window_size=3).learn(10, callback=QuietOnReturn((50, 250)))
+        td3(Returns(), stats_window_size=3).learn(10, callback=callback((50, 250)))
