@@ -177,8 +177,8 @@ def test_shipped_settings_and_a_trained_agent_to_go_on_with(session):
     shipped = yaml.safe_load((Path(__file__).parents[1] / "hyperparams" / "symphony.yml").read_text())["BipedalWalker-v3"]
     # The same, each with its arguments and under its full name
     assert stored["env_wrapper"] == [each if isinstance(each, dict) else {each: {}} for each in shipped["env_wrapper"]]
-    (callback,) = shipped["callback"].items()
-    assert stored["callback"] == [{f"sb3_symphony.common.callbacks.{callback[0]}": callback[1]}]
+    callbacks = [(name, arguments) for each in shipped["callback"] for name, arguments in each.items()]
+    assert stored["callback"] == [{f"sb3_symphony.common.callbacks.{name}": arguments} for name, arguments in callbacks]
     assert second._n_updates > first._n_updates > 0
 
 
