@@ -2,6 +2,7 @@
 
 import copy
 import random
+from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -308,9 +309,9 @@ class _OnReturn(BaseCallback):
             self._follow(float(np.mean([episodes[-k]["r"] for k in range(1, self.n_episodes + 1)])))
         return True
 
+    @abstractmethod
     def _follow(self, recent: float) -> None:
         """What depends on the mean return."""
-        raise NotImplementedError
 
 
 class QuietOnReturn(_OnReturn):
