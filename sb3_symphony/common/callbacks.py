@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, un
 from sb3_symphony.common.checks import check_number, check_pair
 from sb3_symphony.common.ensembles import EnsembleCritic
 from sb3_symphony.common.noise import StickyActionNoise
+from sb3_symphony.common.off_policy import ActsGreedily
 
 
 class QBias(NamedTuple):
@@ -405,3 +406,57 @@ class SlowOnReturn(_OnReturn):
         for name in ("lr_schedule", "critic_lr_schedule"):  # Symphony's critics have their own
             if hasattr(self.model, name):
                 setattr(self.model, name, FloatSchedule(_ScaledSchedule(getattr(self.model, name), factor)))
+
+
+class GreedyEpisodes(BaseCallback):
+    """
+    Every so many training episodes acts as evaluations do: with the deterministic action, of the averaged actor if there is
+    one, and without noise. So the agent meets its own mistakes, and episodes get long as soon as it can walk.
+
+    An agent that does not walk yet may stand still for a whole episode, which teaches nothing. With ``stall_reward`` noise
+    comes back for the rest of an episode once the latest ``stall_steps`` rewards average less.
+
+    :param every: the episode in progress when learning starts is the first, every ``every``-th one is greedy
+    :param stall_reward: mean reward below which an episode is not greedy any more, in the environment's units; ``None``: it
+        is to its end
+    :param stall_steps: number of rewards it is the mean of
+    :param verbose: see SB3
+    :raises TypeError: if a number is none; at the start of training, if the model has no greedy episodes (those of this
+        package have, others with :class:`~sb3_symphony.common.off_policy.ActsGreedily`)
+    :raises ValueError: if a number is out of range
+    """
+
+    def __init__(self, every: int = 2, stall_reward: float | None = None, stall_steps: int = 100, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        check_number("every", every, 1, integer=True)
+        if stall_reward is not None:
+            check_number("stall_reward", stall_reward)
+        check_number("stall_steps", stall_steps, 1, integer=True)
+        self.every = every
+        self.stall_reward = stall_reward
+        self.stall_steps = stall_steps
+        self.episode = 1  # number of the latest one begun since learning started
+        self.recent: list[list[float]] = []  # of each environment the latest rewards of its episode
+
+    def _init_callback(self) -> None:
+        if not isinstance(self.model, ActsGreedily):
+            raise TypeError(f"model: expected one with greedy episodes, such as Symphony, got {type(self.model).__name__}")
+
+    def _on_training_start(self) -> None:
+        self.recent = [[] for _ in range(self.training_env.num_envs)]
+        model: Any = self.model
+        model.greedy_envs = np.zeros(len(self.recent), dtype=bool)
+
+    def _on_step(self) -> bool:
+        model: Any = self.model
+        learning = model.num_timesteps >= model.learning_starts
+        steps = zip(self.locals["rewards"], self.locals["dones"], self.locals["infos"], strict=True)
+        for i, (reward, done, info) in enumerate(steps):
+            self.recent[i] = [*self.recent[i], float(info.get("raw_reward", reward))][-self.stall_steps :]
+            if done:
+                self.recent[i] = []
+                self.episode += learning
+                model.greedy_envs[i] = learning and self.episode % self.every == 0
+            elif self.stall_reward is not None and len(self.recent[i]) == self.stall_steps:
+                model.greedy_envs[i] &= np.mean(self.recent[i]) >= self.stall_reward
+        return True

@@ -33,7 +33,33 @@ MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
 
-class EnsembleOffPolicyAlgorithm(OffPolicyAlgorithm):
+class ActsGreedily(OffPolicyAlgorithm):
+    """
+    Mixin, in front of an off-policy algorithm of SB3: environments named in ``greedy_envs`` get the action that an evaluation
+    would take, without noise. :class:`~sb3_symphony.common.callbacks.GreedyEpisodes` says which, and when.
+    """
+
+    greedy_envs: np.ndarray | None = None  # bool (n_envs,); None: none of them
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+        self.greedy_envs = None  # of a saved model, whose callback may not be there any more
+        return super()._setup_learn(*args, **kwargs)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)  # the noise's clock goes on
+        if self.greedy_envs is None or not self.greedy_envs.any():
+            return action, buffer_action
+        assert self._last_obs is not None
+        greedy, _ = self.predict(self._last_obs, deterministic=True)
+        action, buffer_action = action.copy(), buffer_action.copy()
+        action[self.greedy_envs] = greedy[self.greedy_envs]
+        buffer_action[self.greedy_envs] = self.policy.scale_action(greedy)[self.greedy_envs]
+        return action, buffer_action
+
+
+class EnsembleOffPolicyAlgorithm(ActsGreedily):
     """
     Base class of Symphony and REDQ. Its arguments are those of SB3's ``OffPolicyAlgorithm``.
 

@@ -1,0 +1,189 @@
+"""Training episodes that act as evaluations do."""
+
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from resume_helpers import assert_same_results
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_symphony import REDQ, Symphony
+from sb3_symphony.common.callbacks import GreedyEpisodes
+from sb3_symphony.common.noise import StickyActionNoise
+from sb3_symphony.common.off_policy import ActsGreedily
+from sb3_symphony.common.wrappers import RewardScale
+from sb3_symphony.experiment.config import TrainOptions
+from sb3_symphony.experiment.train import train
+
+LENGTH = 5
+
+
+class Fixed(gym.Env):
+    """Episodes of five steps, whose observations are drawn; the reward is 1 before ``falls`` and 0 from there on."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
+    action_space = gym.spaces.Box(np.array([-1.0, 0.0], dtype=np.float32), np.array([1.0, 3.0], dtype=np.float32))
+
+    def __init__(self, falls=LENGTH):
+        self.falls = falls
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        reward = float(self.steps <= self.falls)
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), reward, self.steps == LENGTH, False, {}
+
+
+class Note(BaseCallback):
+    """Whether each action, and what is stored of it, is that of an evaluation, for every environment."""
+
+    def _init_callback(self):
+        self.seen = []
+
+    def _on_step(self):
+        model = self.model
+        greedy, _ = model.predict(model._last_obs, deterministic=True)
+        matches = np.isclose(self.locals["actions"], greedy, atol=1e-6).all(axis=1)
+        stored = np.isclose(self.locals["buffer_actions"], model.policy.scale_action(greedy), atol=1e-6).all(axis=1)
+        assert (matches == stored).all()
+        self.seen.append(matches.tolist())
+        return True
+
+
+SMALL = dict(batch_size=4, buffer_size=100, seed=0, device="cpu")
+OURS = dict(SMALL, gradient_steps=2, policy_delay=1)
+
+
+def noise():
+    return StickyActionNoise(2, sigma=0.2, independent=0.1)
+
+
+class GreedyTD3(ActsGreedily, TD3):
+    pass
+
+
+class GreedySAC(ActsGreedily, SAC):
+    pass
+
+
+ALGORITHMS = {
+    "symphony": (Symphony, dict(OURS, action_noise=noise()), dict(actor_averaging=0.5)),
+    "redq": (REDQ, OURS, dict(actor_averaging=0.5)),
+    "td3": (GreedyTD3, dict(SMALL, action_noise=noise()), {}),
+    "sac": (GreedySAC, SMALL, {}),
+}
+
+
+def make(algo, env, **kwargs):
+    class_, common, policy_kwargs = ALGORITHMS[algo]
+    return class_("MlpPolicy", env, policy_kwargs=dict(net_arch=[8], **policy_kwargs), **copy.deepcopy(common), **kwargs)
+
+
+def greedy_steps(algo, env, steps, *callbacks, **kwargs):
+    note = Note()
+    make(algo, env, **kwargs).learn(steps, callback=[*callbacks, note])
+    return note.seen
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_every_so_many_episodes(algo, every):
+    seen = greedy_steps(algo, Fixed(), 9 * LENGTH, GreedyEpisodes(every), learning_starts=LENGTH + 2)
+    episodes = [[each[0] for each in seen[k : k + LENGTH]] for k in range(0, len(seen), LENGTH)]
+    # The first one is the warm-up, in the second learning starts
+    expected = [number > 1 and number % every == 0 for number in range(len(episodes))]
+    assert [all(each) for each in episodes] == expected
+    assert [any(each) for each in episodes] == expected
+
+
+def test_without_the_callback_no_action_is_greedy():
+    assert not any(each[0] for each in greedy_steps("symphony", Fixed(), 30, learning_starts=5))
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+@pytest.mark.parametrize("falls, greedy", [(5, 5), (3, 5), (2, 4), (1, 3), (0, 2)])
+def test_noise_comes_back_when_it_stalls(scaled, falls, greedy):
+    """The mean of two of the environment's rewards is below 0.4 once both are 0."""
+    env = RewardScale(Fixed(falls), scale=100.0) if scaled else Fixed(falls)
+    callback = GreedyEpisodes(1, stall_reward=0.4, stall_steps=2)
+    seen = greedy_steps("symphony", env, 4 * LENGTH, callback, learning_starts=1)
+    for k in range(LENGTH, len(seen), LENGTH):
+        assert [each[0] for each in seen[k : k + LENGTH]] == [True] * greedy + [False] * (LENGTH - greedy)
+
+
+def test_each_environment_has_its_own_episodes():
+    """Of two environments whose episodes end together, the second has the even numbers."""
+    seen = greedy_steps("td3", make_vec_env(Fixed, n_envs=2, seed=0), 2 * 6 * LENGTH, GreedyEpisodes(2), learning_starts=2)
+    assert all(not first for first, _ in seen[:LENGTH])
+    episodes = seen[LENGTH:]
+    assert [first for first, _ in episodes] != [second for _, second in episodes]
+    assert {(first, second) for first, second in episodes} == {(True, False)}
+
+
+def test_the_noise_goes_on_falling():
+    """Its clock counts greedy steps too."""
+    model = make("symphony", Fixed(), learning_starts=1)
+    model.learn(20, callback=GreedyEpisodes(1))
+    assert model.action_noise.t == 20
+
+
+def test_a_loaded_model_is_not_greedy_by_itself(tmp_path):
+    model = make("symphony", Fixed(), learning_starts=1).learn(2 * LENGTH + 1, callback=GreedyEpisodes(1))
+    assert model.greedy_envs.all()
+    model.save(tmp_path / "model")
+    note = Note()
+    Symphony.load(tmp_path / "model", env=Fixed(), device="cpu").learn(10, callback=note, reset_num_timesteps=False)
+    assert not any(each[0] for each in note.seen)
+
+
+@pytest.mark.parametrize("algo", ["symphony", "redq"])
+def test_a_killed_run_goes_on_alike(algo, tmp_path):
+    common = dict(
+        algo=algo,
+        env="Pendulum-v1",
+        seed=1,
+        eval_freq=0,
+        verbose=0,
+        progress=False,
+        num_threads=1,
+        save_freq=100,
+        hyperparams={
+            "learning_starts": 50,
+            "batch_size": 16,
+            "gradient_steps": 2,
+            "policy_delay": 3,
+            "policy_kwargs": {"net_arch": [8], "actor_averaging": 0.125},
+            "callback": {"GreedyEpisodes": {"every": 2, "stall_reward": -5.0, "stall_steps": 30}},
+        },
+    )
+    whole = train(TrainOptions(**common, n_timesteps=900, log_folder=str(tmp_path / "whole"))).run.path
+    half = train(TrainOptions(**common, n_timesteps=500, log_folder=str(tmp_path / "half"))).run.path
+    train(TrainOptions(resume=str(half), n_timesteps=900))
+    assert_same_results(whole, half)
+
+
+@pytest.mark.parametrize(
+    "kwargs, error",
+    [
+        (dict(every=0), ValueError),
+        (dict(every=1.5), TypeError),
+        (dict(stall_reward="no"), TypeError),
+        (dict(stall_steps=0), ValueError),
+        (dict(stall_reward=float("nan")), ValueError),
+    ],
+)
+def test_wrong_values(kwargs, error):
+    with pytest.raises(error, match=next(iter(kwargs))):
+        GreedyEpisodes(**kwargs)
+
+
+def test_needs_an_algorithm_that_can():
+    with pytest.raises(TypeError, match="got TD3"):
+        TD3("MlpPolicy", Fixed(), **SMALL).learn(5, callback=GreedyEpisodes())
