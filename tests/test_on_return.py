@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_symphony import REDQ, Symphony
-from sb3_symphony.common.callbacks import CarefulOnReturn, QuietOnReturn, SlowOnReturn
+from sb3_symphony.common.callbacks import QuietOnReturn, SlowOnReturn
 from sb3_symphony.common.noise import StickyActionNoise
 from sb3_symphony.common.wrappers import RewardScale
 
@@ -43,19 +43,6 @@ class Note(BaseCallback):
     def _on_step(self):
         noise = self.model.action_noise
         self.seen.append([each.independent for each in getattr(noise, "noises", [noise])])
-        return True
-
-
-class NoteMix(BaseCallback):
-    """What Symphony's target and actor take of the minimum in each step's update."""
-
-    def _init_callback(self):
-        self.seen = []
-
-    def _on_rollout_start(self):
-        self.seen.append((self.model.target_mix, self.model.actor_mix))
-
-    def _on_step(self):
         return True
 
 
@@ -175,63 +162,11 @@ def test_rates_go_on_alike_from_a_file(tmp_path):
     assert len({critic for _, critic in rest.seen}) > 2
 
 
-@pytest.mark.parametrize("given, of_actor", [(0.8, 0.8), ((0.8, 0.1), 0.1)])
-def test_weight_of_the_minimum_follows_the_reported_returns(given, of_actor):
-    note = NoteMix()
-    model = Symphony("MlpPolicy", Returns(), min_mix=given, **SYMPHONY)
-    model.learn(17, callback=[CarefulOnReturn((50, 150, 250), (1, 0.4, 0.9), n_episodes=1), note])
-    expected_mixes = np.interp(RETURNS, (50, 150, 250), (1, 0.4, 0.9))
-    # SB3 notes an episode after the callback of its last step: the weight is that after the step behind it
-    after_episodes = note.seen[3::2]
-    assert len(after_episodes) == 7
-    assert [target for target, _ in after_episodes] == pytest.approx(expected_mixes[:7])
-    assert {actor for _, actor in note.seen} == {of_actor}
-    assert note.seen[2] == (0.8, of_actor)
-
-
-def test_weight_goes_on_alike_from_a_file(tmp_path):
-    def model(env):
-        return Symphony("MlpPolicy", env, min_mix=(1, 0), **SYMPHONY)
-
-    def callback():
-        return CarefulOnReturn((50, 250), n_episodes=3)
-
-    whole, rest = NoteMix(), NoteMix()
-    model(Returns()).learn(16, callback=[callback(), whole])
-    env = Returns()
-    half = model(env).learn(8, callback=callback())
-    half.save(tmp_path / "half")
-    half.save_replay_buffer(tmp_path / "buffer")
-    loaded = Symphony.load(tmp_path / "half", env=env, device="cpu")
-    loaded.load_replay_buffer(tmp_path / "buffer")
-    env.episode -= 1  # learn() resets the environment once more
-    loaded.learn(8, callback=[callback(), rest], reset_num_timesteps=False)
-    assert rest.seen[1:] == whole.seen[9:] and len({target for target, _ in rest.seen}) > 2
-
-
-def test_more_than_two_returns():
-    """Noise and rates that fall and rise again."""
-    noise, rates = Note(), NoteRates()
-    returns, values = (50, 150, 250), (0.2, 0.05, 0.1)
-    callbacks = [QuietOnReturn(returns, values, n_episodes=1), SlowOnReturn(returns, values, n_episodes=1)]
-    td3(Returns(), policy_delay=1).learn(17, callback=[*callbacks, noise])
-    assert [seen[0] for seen in noise.seen[2::2]] == pytest.approx(np.interp(RETURNS, returns, values))
-    TD3("MlpPolicy", Returns(), learning_rate=1e-3, policy_delay=1, **SMALL).learn(17, callback=[callbacks[1], rates])
-    geometric = 1e-3 * np.exp(np.interp(RETURNS, returns, np.log(values)))
-    assert [seen[0] for seen in rates.seen[3::2]] == pytest.approx(geometric[:7])
-
-
-def test_careful_needs_a_minimum():
-    with pytest.raises(TypeError, match="min_mix, such as Symphony, got TD3"):
-        td3(Returns()).learn(3, callback=CarefulOnReturn((0, 1)))
-
-
-@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, CarefulOnReturn])
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn])
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (dict(returns=(100,)), r"returns=\(100,\): expected two numbers or more"),
-        (dict(returns=(100, 100)), r"returns=\(100, 100\): expected the smaller number first"),
+        (dict(returns=(100,)), r"returns=\(100,\): expected two numbers"),
         (dict(returns=(250, 100)), r"returns=\(250, 100\): expected the smaller number first"),
         (dict(returns=(0, float("nan"))), "returns=nan"),
         (dict(returns=(0, 1), n_episodes=0), "n_episodes=0: expected an integer >= 1"),
@@ -247,10 +182,6 @@ def test_wrong_values_of_their_own():
         QuietOnReturn((0, 1), independent=(0.2, -0.1))
     with pytest.raises(ValueError, match="factors=0: expected a number > 0"):
         SlowOnReturn((0, 1), factors=(1, 0))
-    with pytest.raises(ValueError, match=r"min_mix=1\.5: expected a number >= 0 and <= 1"):
-        CarefulOnReturn((0, 1), min_mix=(1.5, 0))
-    with pytest.raises(ValueError, match=r"min_mix=\(1, 0\): expected 3 numbers, one for each of the returns"):
-        CarefulOnReturn((0, 1, 2), min_mix=(1, 0))
 
 
 def test_refuses_other_noise():
@@ -260,7 +191,7 @@ def test_refuses_other_noise():
             other.learn(3, callback=QuietOnReturn((0, 1)))
 
 
-@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, CarefulOnReturn])
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn])
 def test_more_episodes_than_are_kept(callback):
     with pytest.raises(ValueError, match="n_episodes=5: expected at most the model's stats_window_size, 3"):
         td3(Returns(), stats_window_size=3).learn(10, callback=callback((50, 250)))

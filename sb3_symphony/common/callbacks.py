@@ -1,7 +1,6 @@
 """Callbacks for any off-policy actor-critic, those of SB3 and SB3-Contrib included."""
 
 import copy
-import math
 import random
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, unwrap_vec_normalize
 
-from sb3_symphony.common.checks import check_number
+from sb3_symphony.common.checks import check_number, check_pair
 from sb3_symphony.common.ensembles import EnsembleCritic
 from sb3_symphony.common.noise import StickyActionNoise
 from sb3_symphony.common.off_policy import ActsGreedily
@@ -284,32 +283,21 @@ class _OnReturn(BaseCallback):
     Something that depends on the mean return of recent training episodes. These are kept in the model and saved with it: a
     resumed training goes on alike.
 
-    :param returns: mean returns between which it changes, two or more, rising, in the environment's units
+    :param returns: mean returns between which it changes, in the environment's units
     :param n_episodes: how many episodes are recent
     :param verbose: see SB3
-    :raises TypeError: if a number is none
     :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
         episodes (``stats_window_size``)
     """
 
-    def __init__(self, returns: tuple[float, ...], n_episodes: int, verbose: int) -> None:
+    def __init__(self, returns: tuple[float, float], n_episodes: int, verbose: int) -> None:
         super().__init__(verbose)
-        if not isinstance(returns, tuple | list) or len(returns) < 2:
-            raise ValueError(f"returns={returns!r}: expected two numbers or more (where the change begins, …, where it ends)")
-        for each in returns:
-            check_number("returns", each)
-        if list(returns) != sorted(set(returns)):
+        check_pair("returns", returns, "where the change begins, where it ends")
+        if not returns[0] < returns[1]:
             raise ValueError(f"returns={returns!r}: expected the smaller number first")
         check_number("n_episodes", n_episodes, 1, integer=True)
         self.returns = returns
         self.n_episodes = n_episodes
-
-    def _check_values(self, name: str, values: Any, low: float, high: float = math.inf, exclusive: bool = False) -> None:
-        """One value for each of the returns."""
-        if not isinstance(values, tuple | list) or len(values) != len(self.returns):
-            raise ValueError(f"{name}={values!r}: expected {len(self.returns)} numbers, one for each of the returns")
-        for value in values:
-            check_number(name, value, low, high, exclusive=exclusive)
 
     def _init_callback(self) -> None:
         kept = self.model._stats_window_size
@@ -332,28 +320,28 @@ class QuietOnReturn(_OnReturn):
     Sets the independent part of :class:`~sb3_symphony.common.noise.StickyActionNoise` by what training episodes return:
     who does not walk yet needs more of it than who does, whenever that is.
 
-    Between the returns it is interpolated. What it is set to is kept in the noise and in the model's list of recent
+    Between the two returns it is interpolated. What it is set to is kept in the noise and in the model's list of recent
     episodes, both saved with the model: a resumed training goes on alike.
 
     :param returns: mean return of recent training episodes at which noise begins to fall, and at which it has fallen, in
-        the environment's units; there may be more than two
+        the environment's units
     :param independent: standard deviations there, in scaled action units, >= 0
     :param n_episodes: how many episodes are recent; before there are as many, noise is left as it is
     :param verbose: see SB3
-    :raises TypeError: if a number is none; at the start of training, if the model's action noise is no ``StickyActionNoise``
-    :raises ValueError: if a number is out of range, returns do not rise or are not as many as values; at the start of
-        training, if the model keeps fewer episodes (``stats_window_size``)
+    :raises TypeError: at the start of training, if the model's action noise is no ``StickyActionNoise``
+    :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
+        episodes (``stats_window_size``)
     """
 
     def __init__(
         self,
-        returns: tuple[float, ...],
-        independent: tuple[float, ...] = (0.2, 0.05),
+        returns: tuple[float, float],
+        independent: tuple[float, float] = (0.2, 0.05),
         n_episodes: int = 5,
         verbose: int = 0,
     ) -> None:
         super().__init__(returns, n_episodes, verbose)
-        self._check_values("independent", independent, 0)
+        check_pair("independent", independent, "before, after", 0)
         self.independent = independent
 
     def _noises(self) -> list[StickyActionNoise]:
@@ -373,43 +361,6 @@ class QuietOnReturn(_OnReturn):
             noise.independent = float(np.interp(recent, self.returns, self.independent))
 
 
-class CarefulOnReturn(_OnReturn):
-    """
-    Sets the weight of the critics' minimum in Symphony's target, the first of ``min_mix``, by what training episodes return.
-
-    Who takes the whole minimum falls seldom and is slow to try something new; who takes half of it finds a faster gait by way
-    of falls. ``(120, 220)`` with ``(1, 0.5)`` learns to walk carefully, and then to walk fast.
-
-    Between the returns it is interpolated. What it is set to is kept in the model: a resumed training goes on alike.
-
-    :param returns: mean returns of recent training episodes, two or more, rising, in the environment's units
-    :param min_mix: weights there, in [0, 1]
-    :param n_episodes: how many episodes are recent; before there are as many, the weight is left as it is
-    :param verbose: see SB3
-    :raises TypeError: if a number is none; at the start of training, if the model has no ``min_mix``
-    :raises ValueError: if a number is out of range, returns do not rise or are not as many as weights; at the start of
-        training, if the model keeps fewer episodes (``stats_window_size``)
-    """
-
-    def __init__(
-        self, returns: tuple[float, ...], min_mix: tuple[float, ...] = (1.0, 0.5), n_episodes: int = 5, verbose: int = 0
-    ) -> None:
-        super().__init__(returns, n_episodes, verbose)
-        self._check_values("min_mix", min_mix, 0, 1)
-        self.min_mix = min_mix
-
-    def _init_callback(self) -> None:
-        super()._init_callback()
-        if not hasattr(self.model, "min_mix"):
-            raise TypeError(f"model: expected one with min_mix, such as Symphony, got {type(self.model).__name__}")
-
-    def _follow(self, recent: float) -> None:
-        model: Any = self.model
-        now = model.min_mix
-        of_actor = now[1] if isinstance(now, tuple | list) else now
-        model.min_mix = (float(np.interp(recent, self.returns, self.min_mix)), of_actor)
-
-
 class _ScaledSchedule:
     """A learning rate's schedule times a factor."""
 
@@ -426,28 +377,27 @@ class SlowOnReturn(_OnReturn):
     Scales an algorithm's learning rates by what training episodes return: large ones find a gait soon, small ones keep who
     has one on its feet, whenever that is.
 
-    All rates are scaled alike, each from what the model was given (a number or a schedule); between the returns the
+    All rates are scaled alike, each from what the model was given (a number or a schedule); between the two returns the
     factor is interpolated geometrically. Any algorithm of SB3, SB3-Contrib and this package can be slowed.
 
     :param returns: mean return of recent training episodes at which rates begin to fall, and at which they have fallen, in
-        the environment's units; there may be more than two
+        the environment's units
     :param factors: what rates are multiplied with there, > 0
     :param n_episodes: how many episodes are recent; before there are as many, rates are left as they are
     :param verbose: see SB3
-    :raises TypeError: if a number is none
-    :raises ValueError: if a number is out of range, returns do not rise or are not as many as factors; at the start of
-        training, if the model keeps fewer episodes (``stats_window_size``)
+    :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
+        episodes (``stats_window_size``)
     """
 
     def __init__(
         self,
-        returns: tuple[float, ...],
-        factors: tuple[float, ...] = (1.0, 0.2),
+        returns: tuple[float, float],
+        factors: tuple[float, float] = (1.0, 0.2),
         n_episodes: int = 5,
         verbose: int = 0,
     ) -> None:
         super().__init__(returns, n_episodes, verbose)
-        self._check_values("factors", factors, 0, exclusive=True)
+        check_pair("factors", factors, "before, after", 0, exclusive=True)
         self.factors = factors
 
     def _follow(self, recent: float) -> None:
