@@ -3,6 +3,7 @@
 import copy
 import random
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -436,14 +437,14 @@ class GreedyEpisodes(BaseCallback):
         self.stall_reward = stall_reward
         self.stall_steps = stall_steps
         self.episode = 1  # number of the latest one begun since learning started
-        self.recent: list[list[float]] = []  # of each environment the latest rewards of its episode
+        self.recent: list[deque[float]] = []  # of each environment the latest rewards of its episode
 
     def _init_callback(self) -> None:
         if not isinstance(self.model, ActsGreedily):
             raise TypeError(f"model: expected one with greedy episodes, such as Symphony, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
-        self.recent = [[] for _ in range(self.training_env.num_envs)]
+        self.recent = [deque(maxlen=self.stall_steps) for _ in range(self.training_env.num_envs)]
         model: Any = self.model
         model.greedy_envs = np.zeros(len(self.recent), dtype=bool)
 
@@ -452,9 +453,9 @@ class GreedyEpisodes(BaseCallback):
         learning = model.num_timesteps >= model.learning_starts
         steps = zip(self.locals["rewards"], self.locals["dones"], self.locals["infos"], strict=True)
         for i, (reward, done, info) in enumerate(steps):
-            self.recent[i] = [*self.recent[i], float(info.get("raw_reward", reward))][-self.stall_steps :]
+            self.recent[i].append(float(info.get("raw_reward", reward)))
             if done:
-                self.recent[i] = []
+                self.recent[i].clear()
                 self.episode += learning
                 model.greedy_envs[i] = learning and self.episode % self.every == 0
             elif self.stall_reward is not None and len(self.recent[i]) == self.stall_steps:

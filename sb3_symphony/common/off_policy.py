@@ -53,7 +53,6 @@ class ActsGreedily(OffPolicyAlgorithm):
             return action, buffer_action
         assert self._last_obs is not None
         greedy, _ = self.predict(self._last_obs, deterministic=True)
-        action, buffer_action = action.copy(), buffer_action.copy()
         action[self.greedy_envs] = greedy[self.greedy_envs]
         buffer_action[self.greedy_envs] = self.policy.scale_action(greedy)[self.greedy_envs]
         return action, buffer_action
