@@ -1,6 +1,7 @@
 """Training episodes that act as evaluations do."""
 
 import copy
+import itertools
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +10,7 @@ from resume_helpers import assert_same_results
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_symphony import REDQ, Symphony
 from sb3_symphony.common.callbacks import GreedyEpisodes
@@ -22,22 +24,26 @@ LENGTH = 5
 
 
 class Fixed(gym.Env):
-    """Episodes of five steps, whose observations are drawn; the reward is 1 before ``falls`` and 0 from there on."""
+    """
+    Episodes of five steps, whose observations are drawn; the reward is 1 before ``falls`` and 0 from there on.
+
+    :param falls: steps that are rewarded, a number or one for each episode
+    """
 
     observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
     action_space = gym.spaces.Box(np.array([-1.0, 0.0], dtype=np.float32), np.array([1.0, 3.0], dtype=np.float32))
 
     def __init__(self, falls=LENGTH):
-        self.falls = falls
+        self.falls = itertools.cycle(falls if isinstance(falls, list) else [falls])
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.steps = 0
+        self.steps, self.rewarded = 0, next(self.falls)
         return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
 
     def step(self, action):
         self.steps += 1
-        reward = float(self.steps <= self.falls)
+        reward = float(self.steps <= self.rewarded)
         return self.np_random.uniform(-1, 1, 2).astype(np.float32), reward, self.steps == LENGTH, False, {}
 
 
@@ -92,15 +98,32 @@ def greedy_steps(algo, env, steps, *callbacks, **kwargs):
     return note.seen
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
-@pytest.mark.parametrize("every", [1, 2, 3])
-def test_every_so_many_episodes(algo, every):
-    seen = greedy_steps(algo, Fixed(), 9 * LENGTH, GreedyEpisodes(every), learning_starts=LENGTH + 2)
+ALWAYS = (-1, 100)  # one noisy episode, one greedy one, from the first that has ended
+
+
+def of_episodes(seen):
+    """Whether each episode was greedy, from its first action to its last."""
     episodes = [[each[0] for each in seen[k : k + LENGTH]] for k in range(0, len(seen), LENGTH)]
+    assert all(len(set(each)) == 1 for each in episodes)
+    return [each[0] for each in episodes]
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("in_row", [0, 1, 2])
+def test_some_follow_each_noisy_one(algo, in_row):
+    callback = GreedyEpisodes(ALWAYS, in_row=(in_row, 9), n_episodes=1)
+    seen = greedy_steps(algo, Fixed(), 9 * LENGTH, callback, learning_starts=LENGTH + 2)
     # The first one is the warm-up, in the second learning starts
-    expected = [number > 1 and number % every == 0 for number in range(len(episodes))]
-    assert [all(each) for each in episodes] == expected
-    assert [any(each) for each in episodes] == expected
+    assert of_episodes(seen) == [False, *(k % (in_row + 1) > 0 for k in range(8))]
+
+
+def test_how_many_depends_on_what_recent_ones_return():
+    """Means of two returns; below 2 none is greedy, below 4 one after each noisy one, then two."""
+    returns = [5, 0, 1, 3, 3, 3, 5, 5, 5, 5, 5, 5, 0, 0, 5, 5]
+    expected = [0, 0, 1, 0, 1, 0, 1, 1, 0, 1, 1, 0, 1, 0, 0, 1]
+    callback = GreedyEpisodes((2, 4), in_row=(1, 2), n_episodes=2)
+    seen = greedy_steps("symphony", Fixed(returns), len(returns) * LENGTH, callback, learning_starts=1)
+    assert of_episodes(seen) == expected
 
 
 def test_without_the_callback_no_action_is_greedy():
@@ -112,30 +135,39 @@ def test_without_the_callback_no_action_is_greedy():
 def test_noise_comes_back_when_it_stalls(scaled, falls, greedy):
     """The mean of two of the environment's rewards is below 0.4 once both are 0."""
     env = RewardScale(Fixed(falls), scale=100.0) if scaled else Fixed(falls)
-    callback = GreedyEpisodes(1, stall_reward=0.4, stall_steps=2)
+    callback = GreedyEpisodes(ALWAYS, (3, 9), stall_reward=0.4, stall_steps=2, n_episodes=1)
     seen = greedy_steps("symphony", env, 4 * LENGTH, callback, learning_starts=1)
     for k in range(LENGTH, len(seen), LENGTH):
         assert [each[0] for each in seen[k : k + LENGTH]] == [True] * greedy + [False] * (LENGTH - greedy)
 
 
+class Uneven(Fixed):
+    """Its first episode is over after one step."""
+
+    def step(self, action):
+        *rest, done, truncated, info = super().step(action)
+        first, self.first = getattr(self, "first", True), False
+        return *rest, done or first, truncated, info
+
+
 def test_each_environment_has_its_own_episodes():
-    """Of two environments whose episodes end together, the second has the even numbers."""
-    seen = greedy_steps("td3", make_vec_env(Fixed, n_envs=2, seed=0), 2 * 6 * LENGTH, GreedyEpisodes(2), learning_starts=2)
-    assert all(not first for first, _ in seen[:LENGTH])
-    episodes = seen[LENGTH:]
-    assert [first for first, _ in episodes] != [second for _, second in episodes]
-    assert {(first, second) for first, second in episodes} == {(True, False)}
+    envs = make_vec_env(lambda: Fixed(), n_envs=1).envs[0], make_vec_env(Uneven, n_envs=1).envs[0]
+    env = DummyVecEnv([lambda: envs[0], lambda: envs[1]])
+    seen = greedy_steps("td3", env, 2 * 6 * LENGTH, GreedyEpisodes(ALWAYS, n_episodes=1), learning_starts=1)
+    first, second = ([each[k] for each in seen] for k in range(2))
+    assert of_episodes([[each] for each in first]) == [False, True] * 3
+    assert of_episodes([[each] for each in second[1 : 1 + 5 * LENGTH]]) == [True, False, True, False, True]
 
 
 def test_the_noise_goes_on_falling():
     """Its clock counts greedy steps too."""
     model = make("symphony", Fixed(), learning_starts=1)
-    model.learn(20, callback=GreedyEpisodes(1))
+    model.learn(20, callback=GreedyEpisodes(ALWAYS, n_episodes=1))
     assert model.action_noise.t == 20
 
 
 def test_a_loaded_model_is_not_greedy_by_itself(tmp_path):
-    model = make("symphony", Fixed(), learning_starts=1).learn(2 * LENGTH + 1, callback=GreedyEpisodes(1))
+    model = make("symphony", Fixed(), learning_starts=1).learn(LENGTH + 1, callback=GreedyEpisodes(ALWAYS, n_episodes=1))
     assert model.greedy_envs.all()
     model.save(tmp_path / "model")
     note = Note()
@@ -160,7 +192,9 @@ def test_a_killed_run_goes_on_alike(algo, tmp_path):
             "gradient_steps": 2,
             "policy_delay": 3,
             "policy_kwargs": {"net_arch": [8], "actor_averaging": 0.125},
-            "callback": {"GreedyEpisodes": {"every": 2, "stall_reward": -5.0, "stall_steps": 30}},
+            "callback": {
+                "GreedyEpisodes": {"returns": [-1500, -1200], "stall_reward": -5.0, "stall_steps": 30, "n_episodes": 2}
+            },
         },
     )
     whole = train(TrainOptions(**common, n_timesteps=900, log_folder=str(tmp_path / "whole"))).run.path
@@ -172,8 +206,8 @@ def test_a_killed_run_goes_on_alike(algo, tmp_path):
 @pytest.mark.parametrize(
     "kwargs, error",
     [
-        (dict(every=0), ValueError),
-        (dict(every=1.5), TypeError),
+        (dict(in_row=(1, -1)), ValueError),
+        (dict(in_row=(1.5, 3)), TypeError),
         (dict(stall_reward="no"), TypeError),
         (dict(stall_steps=0), ValueError),
         (dict(stall_reward=float("nan")), ValueError),
@@ -181,9 +215,9 @@ def test_a_killed_run_goes_on_alike(algo, tmp_path):
 )
 def test_wrong_values(kwargs, error):
     with pytest.raises(error, match=next(iter(kwargs))):
-        GreedyEpisodes(**kwargs)
+        GreedyEpisodes(ALWAYS, **kwargs)
 
 
 def test_needs_an_algorithm_that_can():
     with pytest.raises(TypeError, match="got TD3"):
-        TD3("MlpPolicy", Fixed(), **SMALL).learn(5, callback=GreedyEpisodes())
+        TD3("MlpPolicy", Fixed(), **SMALL).learn(5, callback=GreedyEpisodes(ALWAYS))

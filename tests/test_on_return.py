@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_symphony import REDQ, Symphony
-from sb3_symphony.common.callbacks import QuietOnReturn, SlowOnReturn
+from sb3_symphony.common.callbacks import GreedyEpisodes, QuietOnReturn, SlowOnReturn
 from sb3_symphony.common.noise import StickyActionNoise
 from sb3_symphony.common.wrappers import RewardScale
 
@@ -162,7 +162,7 @@ def test_rates_go_on_alike_from_a_file(tmp_path):
     assert len({critic for _, critic in rest.seen}) > 2
 
 
-@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn])
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, GreedyEpisodes])
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -191,7 +191,7 @@ def test_refuses_other_noise():
             other.learn(3, callback=QuietOnReturn((0, 1)))
 
 
-@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn])
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, GreedyEpisodes])
 def test_more_episodes_than_are_kept(callback):
     with pytest.raises(ValueError, match="n_episodes=5: expected at most the model's stats_window_size, 3"):
         td3(Returns(), stats_window_size=3).learn(10, callback=callback((50, 250)))

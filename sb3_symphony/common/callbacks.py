@@ -2,7 +2,6 @@
 
 import copy
 import random
-from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -284,7 +283,7 @@ class _OnReturn(BaseCallback):
     Something that depends on the mean return of recent training episodes. These are kept in the model and saved with it: a
     resumed training goes on alike.
 
-    :param returns: mean returns between which it changes, in the environment's units
+    :param returns: two mean returns at which it changes, or between them, in the environment's units
     :param n_episodes: how many episodes are recent
     :param verbose: see SB3
     :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
@@ -306,14 +305,17 @@ class _OnReturn(BaseCallback):
             raise ValueError(f"n_episodes={self.n_episodes!r}: expected at most the model's stats_window_size, {kept}")
 
     def _on_step(self) -> bool:
-        episodes = self.model.ep_info_buffer
-        if episodes is not None and len(episodes) >= self.n_episodes:
-            self._follow(float(np.mean([episodes[-k]["r"] for k in range(1, self.n_episodes + 1)])))
+        if (recent := self._recent()) is not None:
+            self._follow(recent)
         return True
 
-    @abstractmethod
+    def _recent(self, *latest: float) -> float | None:
+        """The mean return, ``None`` before there are as many; ``latest`` are returns that the model has not noted yet."""
+        returns = [*(episode["r"] for episode in self.model.ep_info_buffer or ()), *latest]
+        return float(np.mean(returns[-self.n_episodes :])) if len(returns) >= self.n_episodes else None
+
     def _follow(self, recent: float) -> None:
-        """What depends on the mean return."""
+        """What depends on the mean return, at each step."""
 
 
 class QuietOnReturn(_OnReturn):
@@ -409,55 +411,80 @@ class SlowOnReturn(_OnReturn):
                 setattr(self.model, name, FloatSchedule(_ScaledSchedule(getattr(self.model, name), factor)))
 
 
-class GreedyEpisodes(BaseCallback):
+class GreedyEpisodes(_OnReturn):
     """
-    Every so many training episodes acts as evaluations do: with the deterministic action, of the averaged actor if there is
-    one, and without noise. So the agent meets its own mistakes, and episodes get long as soon as it can walk.
+    Lets training episodes act as evaluations do: with the deterministic action, of the averaged actor if there is one, and
+    without noise. So the agent meets its own mistakes, and episodes get long as soon as it can walk.
 
-    An agent that does not walk yet may stand still for a whole episode, which teaches nothing. With ``stall_reward`` noise
-    comes back for the rest of an episode once the latest ``stall_steps`` rewards average less.
+    Who only falls so far learns more from noise, and has no greedy episodes: how many of them follow each noisy one depends
+    on what recent episodes return. One that cannot walk may also stand still for a whole episode, which teaches nothing. With
+    ``stall_reward`` noise comes back for the rest of an episode once its latest ``stall_steps`` rewards average less.
 
-    :param every: the episode in progress when learning starts is the first, every ``every``-th one is greedy
+    :param returns: mean return of recent training episodes from which on there are greedy ones, and from which on there are
+        more, in the environment's units
+    :param in_row: how many greedy ones follow each noisy one there
     :param stall_reward: mean reward below which an episode is not greedy any more, in the environment's units; ``None``: it
         is to its end
     :param stall_steps: number of rewards it is the mean of
+    :param n_episodes: how many episodes are recent; before there are as many, none is greedy
     :param verbose: see SB3
     :raises TypeError: if a number is none; at the start of training, if the model has no greedy episodes (those of this
         package have, others with :class:`~sb3_symphony.common.off_policy.ActsGreedily`)
-    :raises ValueError: if a number is out of range
+    :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
+        episodes (``stats_window_size``)
     """
 
-    def __init__(self, every: int = 2, stall_reward: float | None = None, stall_steps: int = 100, verbose: int = 0) -> None:
-        super().__init__(verbose)
-        check_number("every", every, 1, integer=True)
+    def __init__(
+        self,
+        returns: tuple[float, float],
+        in_row: tuple[int, int] = (1, 3),
+        stall_reward: float | None = None,
+        stall_steps: int = 100,
+        n_episodes: int = 5,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(returns, n_episodes, verbose)
+        check_pair("in_row", in_row, "from the first return, from the second", 0, integer=True)
         if stall_reward is not None:
             check_number("stall_reward", stall_reward)
         check_number("stall_steps", stall_steps, 1, integer=True)
-        self.every = every
+        self.in_row = in_row
         self.stall_reward = stall_reward
         self.stall_steps = stall_steps
-        self.episode = 1  # number of the latest one begun since learning started
-        self.recent: list[deque[float]] = []  # of each environment the latest rewards of its episode
+        # Of each environment the latest rewards of its episode, and how many greedy episodes there were in a row
+        self.rewards: list[deque[float]] = []
+        self.row: list[int] = []
 
     def _init_callback(self) -> None:
+        super()._init_callback()
         if not isinstance(self.model, ActsGreedily):
             raise TypeError(f"model: expected one with greedy episodes, such as Symphony, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
-        self.recent = [deque(maxlen=self.stall_steps) for _ in range(self.training_env.num_envs)]
         model: Any = self.model
-        model.greedy_envs = np.zeros(len(self.recent), dtype=bool)
+        n_envs = self.training_env.num_envs
+        self.rewards = [deque(maxlen=self.stall_steps) for _ in range(n_envs)]
+        self.row = [0] * n_envs
+        model.greedy_envs = np.zeros(n_envs, dtype=bool)
 
     def _on_step(self) -> bool:
         model: Any = self.model
-        learning = model.num_timesteps >= model.learning_starts
         steps = zip(self.locals["rewards"], self.locals["dones"], self.locals["infos"], strict=True)
         for i, (reward, done, info) in enumerate(steps):
-            self.recent[i].append(float(info.get("raw_reward", reward)))
+            self.rewards[i].append(float(info.get("raw_reward", reward)))
             if done:
-                self.recent[i].clear()
-                self.episode += learning
-                model.greedy_envs[i] = learning and self.episode % self.every == 0
-            elif self.stall_reward is not None and len(self.recent[i]) == self.stall_steps:
-                model.greedy_envs[i] &= np.mean(self.recent[i]) >= self.stall_reward
+                self.rewards[i].clear()
+                wanted = self._wanted(info) if model.num_timesteps >= model.learning_starts else 0
+                self.row[i] = self.row[i] + 1 if self.row[i] < wanted else 0
+                model.greedy_envs[i] = self.row[i] > 0
+            elif self.stall_reward is not None and len(self.rewards[i]) == self.stall_steps:
+                model.greedy_envs[i] &= np.mean(self.rewards[i]) >= self.stall_reward
         return True
+
+    def _wanted(self, info: dict[str, Any]) -> int:
+        """How many greedy episodes there may be in a row, once one has ended with ``info``."""
+        ended = [info["episode"]["r"]] if "episode" in info else []
+        recent = self._recent(*ended)
+        if recent is None or recent < self.returns[0]:
+            return 0
+        return self.in_row[recent >= self.returns[1]]
