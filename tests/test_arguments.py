@@ -1,6 +1,7 @@
 """Bad arguments: one clear line that names the argument and its value."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -159,6 +160,26 @@ def test_choices(make, name, value, nearest):
     message = refused(make, name, value, ValueError)
     if nearest is not None:
         assert f"did you mean '{nearest}'?" in message
+
+
+@pytest.mark.parametrize(
+    "kwargs, message",
+    [
+        (dict(critic_loss="hl_gauss"), "critic_loss='hl_gauss': expected policy_kwargs with a value_range (low, high)"),
+        (dict(critic_loss="huber", policy_kwargs=dict(value_range=(0, 1))), "critic_loss='huber': expected 'hl_gauss' with"),
+        (dict(critic_loss="hl_gauss", policy_kwargs=dict(value_range=(1, 0))), "value_range=(1, 0): expected the smaller"),
+        (dict(critic_loss="hl_gauss", policy_kwargs=dict(value_range=7)), "value_range=7: expected two numbers"),
+        (dict(critic_loss="hl_gauss", policy_kwargs=dict(value_range=(0, 1), n_bins=1)), "n_bins=1: expected an integer >= 2"),
+    ],
+)
+def test_critics_that_classify(make, kwargs, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make(**kwargs)
+
+
+def test_the_mean_of_classifications_is_none(small):
+    with pytest.raises(ValueError, match="critic_reduction='ensemble_mean': expected 'independent' for 'hl_gauss'"):
+        small(REDQ, critic_loss="hl_gauss", critic_reduction="ensemble_mean", policy_kwargs=dict(value_range=(0, 1)))
 
 
 @pytest.mark.parametrize("value", [(1.5, 0), [1, 1.5]])

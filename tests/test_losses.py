@@ -1,12 +1,17 @@
+import itertools
 import math
+import re
+from statistics import NormalDist
 
 import pytest
 import torch as th
+from torch.nn import functional as F
 
 from sb3_symphony.common.layers import LeakySine
 from sb3_symphony.common.losses import (
     ACTOR_LOSSES,
     CRITIC_LOSSES,
+    ValueBins,
     huber,
     mean_value,
     mse,
@@ -181,3 +186,65 @@ def test_range_and_slope_of_leaky_sine():
     for slope in (0.0, 0.1, 0.5):
         y = LeakySine(slope)(x)
         assert y.min().item() == pytest.approx(-slope, abs=1e-5) and y.max().item() == pytest.approx(1, abs=1e-5)
+
+
+# Classification -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [-100.0, -2.0, -0.3, 0.0, 1.7, 4.0, 9.0])
+def test_a_value_is_a_normal_distribution_over_the_bins(value):
+    bins = ValueBins((-2, 4), n_bins=8).double()
+    normal = NormalDist(min(max(value, -2), 4), 0.75 * 6 / 8)
+    edges = [-2 + 6 / 8 * k for k in range(9)]
+    mass = [normal.cdf(high) - normal.cdf(low) for low, high in itertools.pairwise(edges)]
+    expected = [each / sum(mass) for each in mass]
+    assert bins.probabilities(th.tensor([[value]], dtype=th.float64))[0].tolist() == approx(expected)
+
+
+def test_values_are_those_expected():
+    bins = ValueBins((-3, 3), n_bins=3).double()
+    probabilities = th.tensor([[[0.2, 0.3, 0.5], [1 / 3] * 3]], dtype=th.float64)
+    assert bins(probabilities.log() + 7).flatten().tolist() == approx([0.6, 0.0])
+
+
+def test_far_from_the_ends_a_value_comes_back():
+    bins = ValueBins((-60, 60)).double()
+    values = th.linspace(-50, 50, 37, dtype=th.float64)[:, None]
+    th.testing.assert_close(bins(bins.probabilities(values).clamp_min(1e-300).log()), values, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_cross_entropy_and_its_slope(weighted):
+    th.manual_seed(0)
+    bins = ValueBins((-3, 5), n_bins=7).double()
+    logits = th.randn(2, 6, 7, dtype=th.float64, requires_grad=True)
+    target = 4 * th.randn(6, 1, dtype=th.float64)
+    weights = th.rand(6, 1, dtype=th.float64) if weighted else None
+    loss = bins.loss(logits, target, weights)
+    each = th.stack([F.cross_entropy(critic, bins.probabilities(target), reduction="none") for critic in logits])  # (2, 6)
+    th.testing.assert_close(loss, (each * (1 if weights is None else weights[:, 0])).mean(dim=1))
+    (slope,) = th.autograd.grad(loss.sum(), logits)
+    th.testing.assert_close(bins.loss_slope(logits, target, weights), slope)
+
+
+def test_slope_of_the_values_expected():
+    th.manual_seed(0)
+    bins = ValueBins((-3, 5), n_bins=7).double()
+    logits = th.randn(2, 6, 7, dtype=th.float64, requires_grad=True)
+    grad = th.randn(2, 6, 1, dtype=th.float64)
+    (slope,) = th.autograd.grad((bins(logits) * grad).sum(), logits)
+    th.testing.assert_close(bins.forward_slope(logits, grad), slope)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (((1,),), "value_range=(1,): expected two numbers (lowest, highest)"),
+        (((2, -2),), "value_range=(2, -2): expected the smaller number first"),
+        (((0, float("inf")),), "value_range=inf: expected a number"),
+        (((0, 1), 1), "n_bins=1: expected an integer >= 2"),
+    ],
+)
+def test_wrong_bins(arguments, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        ValueBins(*arguments)

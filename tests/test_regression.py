@@ -115,6 +115,32 @@ def test_losses(loss, reduction, weighted):
     assert_equal_runs(*pair(loss=loss, reduction=reduction), weighted=weighted)
 
 
+BINS = dict(value_range=(-2.0, 3.0), n_bins=9)
+
+
+@pytest.mark.parametrize("weighted", [False, True], ids=["plain", "weights"])
+@pytest.mark.parametrize("n_critics", [1, 3])
+@pytest.mark.parametrize("kwargs", [{}, dict(layer_norm=True, dropout_rate=0.2), dict(net_arch=[])], ids=str)
+def test_classification(weighted, n_critics, kwargs):
+    assert_equal_runs(*pair(loss="hl_gauss", n_critics=n_critics, **BINS, **kwargs), weighted=weighted)
+
+
+def test_classification_is_that_of_separate_networks():
+    """Each of them with torch's own cross-entropy toward the probabilities of the bins."""
+    fitter = regression("fused", loss="hl_gauss", dropout_rate=0.0, **BINS)
+    networks = separate_networks(fitter.critic.q_networks)
+    optimizer = th.optim.Adam([p for network in networks for p in network.parameters()], lr=3e-3)
+    for i in range(5):
+        observations, actions, target = batch_of(24, seed=i)
+        fitter.fit(observations, actions, target, TAU)
+        logits = [network(th.cat([observations, actions], dim=1)) for network in networks]
+        loss = sum(nn.functional.cross_entropy(each, fitter.critic.bins.probabilities(target)) for each in logits)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert_same_weights(fitter.critic.q_networks, networks, 1e-9)
+
+
 @pytest.mark.parametrize("optimizer", [th.optim.Adam, th.optim.AdamW])
 @pytest.mark.parametrize(
     "optimizer_kwargs", [dict(weight_decay=0.05), dict(betas=(0.5, 0.9), eps=1e-3), dict(betas=(0.8, 0.99), weight_decay=0.1)]
@@ -148,8 +174,9 @@ def test_batch_size_that_changes(kwargs):
 @pytest.mark.parametrize("net_arch", [[], [16, 8]], ids=str)
 @pytest.mark.parametrize("layer_norm", [False, True])
 @pytest.mark.parametrize("dropout_rate", [0.0, 0.3])
-def test_values_for_the_actor_and_the_target(activation_fn, net_arch, layer_norm, dropout_rate):
-    kwargs = dict(activation_fn=activation_fn, net_arch=net_arch, layer_norm=layer_norm, dropout_rate=dropout_rate)
+@pytest.mark.parametrize("bins", [{}, dict(loss="hl_gauss", **BINS)], ids=["values", "bins"])
+def test_values_for_the_actor_and_the_target(activation_fn, net_arch, layer_norm, dropout_rate, bins):
+    kwargs = dict(activation_fn=activation_fn, net_arch=net_arch, layer_norm=layer_norm, dropout_rate=dropout_rate, **bins)
     results = []
     for fitter in pair(n_critics=4, **kwargs):
         th.manual_seed(2)
@@ -414,7 +441,7 @@ def test_critic_loss_of_the_reference(reduction, loss, gradient):
     """``ensemble_mean`` without the factor 1/2 of the reference."""
     fitter = regression("autograd", n_critics=2, reduction=reduction)
     q_values = th.tensor([[1.0, 2.0], [3.0, 5.0]], dtype=th.float64).t()[..., None].clone().requires_grad_()
-    value = fitter.loss(fitter._error(q_values, th.tensor([[2.0], [4.0]], dtype=th.float64)), None).sum()
+    value = fitter.objective.loss(q_values, th.tensor([[2.0], [4.0]], dtype=th.float64), None).sum()
     value.backward()
     assert value.item() == pytest.approx(loss)
     assert q_values.grad[..., 0].t().tolist() == gradient

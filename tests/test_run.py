@@ -73,6 +73,18 @@ def test_targets_and_losses(make, target_mode, critic_loss):
     assert not th.equal(weights(model.critic), before)
 
 
+@pytest.mark.parametrize("critic_engine", ["fused", "autograd"])
+def test_critics_that_classify(make, critic_engine):
+    """Their values stay inside the bins."""
+    model = make(critic_loss="hl_gauss", policy_kwargs=dict(value_range=(-1.0, 2.0), n_bins=7, critic_engine=critic_engine))
+    before = weights(model.critic)
+    model.learn(60)
+    assert_finite(model)
+    assert not th.equal(weights(model.critic), before)
+    q_values = model.critic(th.randn(20, 3), th.rand(20, 1) * 2 - 1)
+    assert q_values.shape == (model.n_critics, 20, 1) and ((q_values > -1) & (q_values < 2)).all()
+
+
 @pytest.mark.parametrize("cls", [REDQ, DroQ])
 @pytest.mark.parametrize("critic_engine", ["fused", "autograd"])
 @pytest.mark.parametrize("critic_reduction", ["independent", "ensemble_mean"])

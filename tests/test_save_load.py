@@ -65,6 +65,7 @@ OPTIONS = {
     "fading": dict(replay_buffer_class=FadingReplayBuffer, replay_buffer_kwargs=dict(fade_factor=3.0)),
     "dropout": dict(policy_kwargs=dict(dropout_rate=0.2, layer_norm=True)),
     "averaged actor": dict(policy_kwargs=dict(actor_averaging=0.1)),
+    "classification": dict(critic_loss="hl_gauss", policy_kwargs=dict(value_range=(-20, 5), n_bins=9)),
     "AdamW": dict(policy_kwargs=dict(optimizer_class=th.optim.AdamW)),
     "SGD": dict(policy_kwargs=dict(optimizer_class=th.optim.SGD, optimizer_kwargs=dict(momentum=0.9))),
     "schedule": dict(learning_rate=lambda left: 1e-3 * left),

@@ -13,6 +13,7 @@ from torch import nn
 
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear
+from sb3_symphony.common.losses import ValueBins
 
 T = TypeVar("T")
 
@@ -159,6 +160,9 @@ class EnsembleCritic(BaseModel):
     :param dropout_rate: Dropout after each hidden linear layer
     :param leaky_slope: Slope of the ``LeakySine`` activations
     :param init: Initialisation of the linear layers, ``"default"`` (as torch) or ``"xavier"``
+    :param value_range: Lowest and highest value of critics that classify, see
+        :class:`~sb3_symphony.common.losses.ValueBins`; ``None``: they have one output, the value
+    :param n_bins: Their number of bins
     """
 
     features_extractor: Any
@@ -178,6 +182,8 @@ class EnsembleCritic(BaseModel):
         dropout_rate: float = 0.0,
         leaky_slope: float = 0.1,
         init: str = "default",
+        value_range: tuple[float, float] | None = None,
+        n_bins: int = 51,
     ) -> None:
         super().__init__(
             observation_space,
@@ -188,7 +194,9 @@ class EnsembleCritic(BaseModel):
         self.share_features_extractor = share_features_extractor
         self.n_critics = n_critics
         hidden = hidden_layers(net_arch, activation_fn, layer_norm, dropout_rate, leaky_slope)
-        self.q_networks = StackedMLP(n_critics, features_dim + get_action_dim(action_space), 1, hidden, init)
+        self.bins = None if value_range is None else ValueBins(value_range, n_bins)
+        n_outputs = 1 if self.bins is None else n_bins
+        self.q_networks = StackedMLP(n_critics, features_dim + get_action_dim(action_space), n_outputs, hidden, init)
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
         """
@@ -197,6 +205,11 @@ class EnsembleCritic(BaseModel):
         :param members: Indices of the critics to compute, all of them by default
         :return: ``(n_critics, batch, 1)``
         """
+        outputs = self.outputs(obs, actions, members)
+        return outputs if self.bins is None else self.bins(outputs)
+
+    def outputs(self, obs: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
+        """What the networks give, before bins become a value: ``(n_critics, batch, 1 or n_bins)``; parameters as above."""
         # A shared features extractor is trained by the actor's loss alone, as in SB3
         with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
             features = self.extract_features(obs, self.features_extractor)

@@ -270,6 +270,26 @@ class Output(Layer):
         output_backward(array(grad)[..., 0], self.input, self.weights[0], *self.weight_grads, array(grad_input))
 
 
+class WideOutput(Layer):
+    """The last layer, with several units. Parameters and return values as in :class:`Output`."""
+
+    def __init__(self, linear: StackedLinear, batch_size: int) -> None:
+        super().__init__(linear, batch_size)
+        self.bias = linear.bias.detach()
+        self.products = Products(self.weight)
+
+    def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
+        n = len(members)
+        self.input = x.expand(n, -1, -1)
+        out = self.out[:n]
+        self.products.forward(self.input, members, out)
+        return out.add_(self.bias if n == len(self.bias) else self.bias[members])
+
+    def backward(self, grad: th.Tensor, grad_input: th.Tensor) -> None:
+        th.sum(grad, dim=1, keepdim=True, out=self.grads[1])
+        self.products.backward(self.input, grad, self.grads[0], grad_input)
+
+
 class FusedNetwork:
     """
     The passes of a :class:`~sb3_symphony.common.ensembles.StackedMLP` for one batch size.
@@ -300,7 +320,7 @@ class FusedNetwork:
             self.hidden.append(Hidden(linear, dropout, norm, activation, batch_size, bfloat16))
         (last,) = modules
         assert isinstance(last, StackedLinear)
-        self.output = Output(last, batch_size)
+        self.output = (Output if last.weight.shape[-1] == 1 else WideOutput)(last, batch_size)
         self.grad_input = self.input.new_empty(n_members, batch_size, in_features)
 
         layers: list[Layer] = [*self.hidden, self.output]
@@ -318,7 +338,7 @@ class FusedNetwork:
         :param features: ``(batch, features_dim)``
         :param actions: ``(batch, action_dim)``
         :param members: Compute these networks only
-        :return: ``(n_members, batch, 1)``, valid until the next call
+        :return: ``(n_members, batch, n_outputs)``, valid until the next call
         """
         chosen = self.all_members if members is None else np.array(members)
         x = th.cat((features, actions), dim=1, out=self.input)
@@ -330,7 +350,7 @@ class FusedNetwork:
         """
         Write the gradients of all parameters to ``grads``. The call before must have been ``forward`` of all members.
 
-        :param grad: Gradient with respect to the result of ``forward`` ``(n_members, batch, 1)``
+        :param grad: Gradient with respect to the result of ``forward`` ``(n_members, batch, n_outputs)``
         """
         for layer, grad_input in self._backward_layers(grad):
             layer.products.backward(layer.input, layer.grad, layer.grads[0], grad_input)

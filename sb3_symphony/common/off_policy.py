@@ -24,7 +24,7 @@ from sb3_symphony.common.buffers import (
 )
 from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
-from sb3_symphony.common.losses import CRITIC_LOSSES
+from sb3_symphony.common.losses import CLASSIFICATION, CRITIC_LOSSES
 from sb3_symphony.common.noise import DecayingActionNoise
 from sb3_symphony.common.regression import make_regression
 
@@ -65,7 +65,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
     :param n_critics: Number of critics; may be given in ``policy_kwargs`` instead
     :param policy_delay: Critic updates per actor update
     :param target_mode: How the target combines the critics: ``"min"``, ``"mean"`` or ``"rem"``
-    :param critic_loss: Error function, see :data:`sb3_symphony.common.losses.CRITIC_LOSSES`
+    :param critic_loss: Error function, see :data:`sb3_symphony.common.losses.CRITIC_LOSSES`; ``"hl_gauss"`` for critics that
+        classify, whose ``policy_kwargs`` have a ``value_range``
     :param critic_reduction: ``"independent"`` (each critic meets the target) or ``"ensemble_mean"`` (their mean does)
     :raises ValueError: if an argument is out of range, or the action space no bounded Box
     :raises TypeError: if an argument has the wrong type
@@ -131,14 +132,24 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         check_number("n_critics", self.n_critics, 1, integer=True)
         check_number("policy_delay", self.policy_delay, 1, integer=True)
         check_choice("target_mode", self.target_mode, TARGET_MODES)
-        check_choice("critic_loss", self.critic_loss, CRITIC_LOSSES)
+        check_choice("critic_loss", self.critic_loss, (*CRITIC_LOSSES, CLASSIFICATION))
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
+        self._check_classification()
         if self.n_critics != self.policy_kwargs["n_critics"]:
             raise ValueError(f"n_critics={self.n_critics!r}: the saved model has {self.policy_kwargs['n_critics']!r}")
         if self.action_noise is not None and not isinstance(self.action_noise, ActionNoise):
             raise TypeError(f"action_noise={self.action_noise!r}: expected an ActionNoise or None")
         if self.optimize_memory_usage and self.n_steps > 1:
             raise ValueError("optimize_memory_usage=True: n-step returns need n_steps=1 then")
+
+    def _check_classification(self) -> None:
+        value_range = self.policy_kwargs.get("value_range")
+        if self.critic_loss == CLASSIFICATION and value_range is None:
+            raise ValueError(f"critic_loss={CLASSIFICATION!r}: expected policy_kwargs with a value_range (low, high)")
+        if self.critic_loss != CLASSIFICATION and value_range is not None:
+            raise ValueError(f"critic_loss={self.critic_loss!r}: expected {CLASSIFICATION!r} with value_range={value_range!r}")
+        if self.critic_loss == CLASSIFICATION and self.critic_reduction != "independent":
+            raise ValueError(f"critic_reduction={self.critic_reduction!r}: expected 'independent' for {CLASSIFICATION!r}")
 
     # ---------------------------------------------------------------- set-up
 

@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from sb3_symphony.common.ensembles import EnsembleCritic, StackedMLP
 from sb3_symphony.common.fused import FusedNetwork, array, uncovered
 from sb3_symphony.common.kernels import adam_polyak
-from sb3_symphony.common.losses import CRITIC_LOSS_SLOPES, CRITIC_LOSSES
+from sb3_symphony.common.losses import CRITIC_LOSS_SLOPES, CRITIC_LOSSES, ValueBins
 
 logger = logging.getLogger(__name__)
 
@@ -32,19 +32,70 @@ class Fit(NamedTuple):
     q_values: th.Tensor
 
 
+class Error:
+    """
+    The objective of critics whose outputs are values: to have small errors.
+
+    :param loss: Error function by name
+    :param reduction: ``"independent"`` or ``"ensemble_mean"``
+    """
+
+    def __init__(self, loss: str, reduction: str) -> None:
+        self._loss, self._slope, self.reduction = CRITIC_LOSSES[loss], CRITIC_LOSS_SLOPES[loss], reduction
+
+    def _error(self, outputs: th.Tensor, target: th.Tensor) -> th.Tensor:
+        """``(n_critics, batch, 1)``, or ``(1, batch, 1)`` if the critics' mean is what meets the target."""
+        return target - (outputs if self.reduction == "independent" else outputs.mean(dim=0, keepdim=True))
+
+    def loss(self, outputs: th.Tensor, target: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+        """
+        :param outputs: What the networks give ``(n_critics, batch, n_outputs)``
+        :param target: ``(batch, 1)``
+        :param weights: Importance weights ``(batch, 1)`` of a prioritised replay
+        :return: The loss of each critic ``(n_critics,)``, or of their mean ``(1,)``
+        """
+        return self._loss(self._error(outputs, target), weights)
+
+    def loss_slope(self, outputs: th.Tensor, target: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+        """The derivative of the sum of losses with respect to ``outputs``."""
+        error = self._error(outputs, target)
+        # d error / d outputs = -1, or -1 / n_critics where the error is that of their mean
+        return self._slope(error, weights).expand_as(outputs) * (-len(error) / len(outputs))
+
+    def values(self, outputs: th.Tensor) -> th.Tensor:
+        """The critics' values ``(n_critics, batch, 1)``, in memory of their own."""
+        return outputs.clone()
+
+    def values_slope(self, outputs: th.Tensor, grad: th.Tensor) -> th.Tensor:
+        """The gradient with respect to ``outputs`` of what has the gradient ``grad`` with respect to the values."""
+        return grad
+
+
+class Classification:
+    """
+    The objective of critics whose outputs are logits of bins: each finds the one of the target. Methods as in :class:`Error`.
+
+    :param bins: The bins
+    """
+
+    def __init__(self, bins: ValueBins) -> None:
+        self.loss, self.loss_slope, self.values, self.values_slope = bins.loss, bins.loss_slope, bins, bins.forward_slope
+
+
 class CriticRegression:
     """
     Steps the critics toward a target and their targets toward them, by plain autograd.
 
     :param critic: The critics; ``critic.optimizer`` is the optimiser that is stepped
     :param critic_target: Their targets
-    :param loss: Error function by name, see :data:`sb3_symphony.common.losses.CRITIC_LOSSES`
+    :param loss: Error function by name, see :data:`sb3_symphony.common.losses.CRITIC_LOSSES`; ``"hl_gauss"`` for critics
+        that classify
     :param reduction: ``"independent"``: sum of each critic's loss; ``"ensemble_mean"``: loss of the critics' mean
     """
 
     def __init__(self, critic: EnsembleCritic, critic_target: EnsembleCritic, loss: str, reduction: str) -> None:
         self.critic, self.critic_target = critic, critic_target
-        self.loss, self.reduction = CRITIC_LOSSES[loss], reduction
+        self.objective = Error(loss, reduction) if critic.bins is None else Classification(critic.bins)
         # Running statistics of batch normalisation (in features extractors) are copied, as in SB3
         self.running_stats = get_parameters_by_name(critic, ["running_"])
         self.running_stats_target = get_parameters_by_name(critic_target, ["running_"])
@@ -67,8 +118,8 @@ class CriticRegression:
         :param weights: Importance weights ``(batch, 1)`` of a prioritised replay
         :return: The loss and the critics' values before the step
         """
-        q_values = self.critic(observations, actions)  # (n_critics, batch, 1)
-        loss = self.loss(self._error(q_values, target), weights).sum()
+        outputs = self.critic.outputs(observations, actions)  # (n_critics, batch, 1 or n_bins)
+        loss = self.objective.loss(outputs, target, weights).sum()
 
         self.critic.optimizer.zero_grad()
         loss.backward()
@@ -76,11 +127,7 @@ class CriticRegression:
 
         polyak_update(self.critic.parameters(), self.critic_target.parameters(), tau)
         polyak_update(self.running_stats, self.running_stats_target, 1.0)
-        return Fit(loss.detach(), q_values.detach())
-
-    def _error(self, q_values: th.Tensor, target: th.Tensor) -> th.Tensor:
-        """``(n_critics, batch, 1)``, or ``(1, batch, 1)`` if the critics' mean is what meets the target."""
-        return target - (q_values if self.reduction == "independent" else q_values.mean(dim=0, keepdim=True))
+        return Fit(loss.detach(), self.objective.values(outputs.detach()))
 
     def q_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         """
@@ -109,15 +156,18 @@ class _QValues(th.autograd.Function):
     """The critics' values by hand-written passes, differentiable with respect to the actions alone."""
 
     @staticmethod
-    def forward(ctx: Any, actions: th.Tensor, features: th.Tensor, network: FusedNetwork) -> th.Tensor:
-        ctx.network, ctx.action_dim = network, actions.shape[1]
-        ctx.values = network.forward(features, actions)
-        return ctx.values.clone()
+    def forward(
+        ctx: Any, actions: th.Tensor, features: th.Tensor, network: FusedNetwork, objective: Error | Classification
+    ) -> th.Tensor:
+        ctx.network, ctx.objective, ctx.action_dim = network, objective, actions.shape[1]
+        ctx.outputs = network.forward(features, actions)
+        return objective.values(ctx.outputs)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor, None, None]:
-        return ctx.network.action_gradient(grad, ctx.action_dim), None, None
+    def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor, None, None, None]:
+        slope = ctx.objective.values_slope(ctx.outputs, grad)
+        return ctx.network.action_gradient(slope, ctx.action_dim), None, None, None
 
 
 class FusedRegression(CriticRegression):
@@ -132,7 +182,6 @@ class FusedRegression(CriticRegression):
     ) -> None:
         super().__init__(critic, critic_target, loss, reduction)
         self.bfloat16 = bfloat16
-        self.slope = CRITIC_LOSS_SLOPES[loss]
         self._networks: dict[EnsembleCritic, list[FusedNetwork]] = {}
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
         self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])  # and addresses of the optimiser's state, both in them
@@ -150,22 +199,22 @@ class FusedRegression(CriticRegression):
         with th.no_grad():
             network = self._network(self.critic, len(actions))
             features = self.critic.extract_features(observations, self.critic.features_extractor)
-            q_values = network.forward(features, actions).clone()
-            error = self._error(q_values, target)
-            # d error / d q_values = -1, or -1 / n_critics where the error is that of their mean
-            network.backward(self.slope(error, weights).expand_as(q_values) * (-len(error) / len(q_values)))
+            outputs = network.forward(features, actions)
+            network.backward(self.objective.loss_slope(outputs, target, weights))
+            fit = Fit(self.objective.loss(outputs, target, weights).sum(), self.objective.values(outputs))
             self._step(network, tau)
-            return Fit(self.loss(error, weights).sum(), q_values)
+            return fit
 
     def q_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         with th.no_grad():
             features = self.critic.extract_features(observations, self.critic.features_extractor)
-        return _QValues.apply(actions, features, self._network(self.critic, len(actions)))
+        return _QValues.apply(actions, features, self._network(self.critic, len(actions)), self.objective)
 
     def target_q_values(self, observations: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
         with th.no_grad():
             features = self.critic_target.extract_features(observations, self.critic_target.features_extractor)
-            return self._network(self.critic_target, len(actions)).forward(features, actions, members)
+            outputs = self._network(self.critic_target, len(actions)).forward(features, actions, members)
+            return self.objective.values(outputs)
 
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
         known = self._networks.get(critic, [])

@@ -43,6 +43,9 @@ class REDQPolicy(AveragedActor, SACPolicy):
     :param share_features_extractor: Whether to share or not the features extractor between the actor and the critics
     :param layer_norm: Whether the critics normalise each hidden layer before its activation
     :param dropout_rate: Dropout after the critics' hidden linear layers, active in the targets too (DroQ)
+    :param value_range: Makes critics classify: lowest and highest value that their bins cover, for ``critic_loss="hl_gauss"``,
+        see :class:`~sb3_symphony.common.losses.ValueBins`
+    :param n_bins: Their number of bins
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16: less precise, and up to 1.6 times as fast where networks are large and the processor has it
@@ -75,6 +78,8 @@ class REDQPolicy(AveragedActor, SACPolicy):
         share_features_extractor: bool = False,
         layer_norm: bool | Sequence[bool] = False,
         dropout_rate: float = 0.0,
+        value_range: tuple[float, float] | None = None,
+        n_bins: int = 51,
         critic_engine: str = "auto",
         actor_averaging: float = 0.0,
     ) -> None:
@@ -82,6 +87,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
         check_number("actor_averaging", actor_averaging, 0, 1)
         check_net_arch(net_arch)  # before the parent, which builds the actor
         self.critic_engine = critic_engine
+        self.value_range, self.n_bins = value_range, n_bins  # used by the parent, which builds the networks
         self.layer_norm, self.dropout_rate = layer_norm, dropout_rate  # before the parent, which builds the networks
         super().__init__(
             observation_space,
@@ -113,9 +119,8 @@ class REDQPolicy(AveragedActor, SACPolicy):
     # SB3 annotates its own class of critics, which the ensemble stands in for
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return EnsembleCritic(**critic_kwargs, layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, init="xavier").to(
-            self.device
-        )
+        critic_kwargs.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, init="xavier")
+        return EnsembleCritic(**critic_kwargs, value_range=self.value_range, n_bins=self.n_bins).to(self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
@@ -125,6 +130,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate)
+        data.update(value_range=self.value_range, n_bins=self.n_bins)
         data.update(critic_engine=self.critic_engine, actor_averaging=self.actor_averaging)
         data.update(share_features_extractor=self.share_features_extractor)  # which SACPolicy leaves out
         return data

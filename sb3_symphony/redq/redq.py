@@ -54,7 +54,8 @@ class REDQ(EnsembleOffPolicyAlgorithm):
     :param policy_delay: Critic updates per update of the actor and the entropy coefficient
     :param target_mode: How the target combines the critics: ``"min"`` over the subset, ``"mean"`` over all, or ``"rem"``,
         a random convex combination of all
-    :param critic_loss: Error function of the critics: ``"mse"``, ``"huber"``, ``"rehe"`` or ``"rehe_elementwise"``
+    :param critic_loss: Error function of the critics: ``"mse"``, ``"huber"``, ``"rehe"`` or ``"rehe_elementwise"``;
+        ``"hl_gauss"`` for critics that classify, which need ``policy_kwargs`` with a ``value_range``
     :param critic_reduction: ``"independent"``: every critic fits the target; ``"ensemble_mean"``: their mean does
     :param ent_coef: Entropy regularization coefficient. ``"auto"`` learns it (``"auto_0.1"``: starting from 0.1)
     :param target_entropy: Target entropy when learning ``ent_coef``: a number, ``"auto"`` (minus the action dimension) or

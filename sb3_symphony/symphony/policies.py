@@ -95,6 +95,9 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
     :param layer_norm: LayerNorm before the activation(s)
     :param dropout_rate: Dropout after the critics' hidden linear layers, active in the targets too
     :param leaky_slope: Slope of the ``LeakySine`` activations
+    :param value_range: Makes critics classify: lowest and highest value that their bins cover, for ``critic_loss="hl_gauss"``,
+        see :class:`~sb3_symphony.common.losses.ValueBins`
+    :param n_bins: Their number of bins
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16: less precise, and up to 1.6 times as fast where networks are large and the processor has it
@@ -124,12 +127,15 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
         layer_norm: LayerNorms | dict[str, LayerNorms] = (True, False),
         dropout_rate: float = 0.0,
         leaky_slope: float = 0.1,
+        value_range: tuple[float, float] | None = None,
+        n_bins: int = 51,
         critic_engine: str = "auto",
         actor_averaging: float = 0.0,
     ) -> None:
         check_choice("critic_engine", critic_engine, ENGINES)
         check_number("actor_averaging", actor_averaging, 0, 1)
         self.critic_engine = critic_engine
+        self.value_range, self.n_bins = value_range, n_bins  # used by the parent, which builds the networks
         self.layer_norm, self.dropout_rate, self.leaky_slope = layer_norm, dropout_rate, leaky_slope  # used by the parent
         super().__init__(
             observation_space,
@@ -180,7 +186,7 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         kwargs = {**critic_kwargs, **self._network_kwargs("qf"), "dropout_rate": self.dropout_rate}
-        return EnsembleCritic(**kwargs).to(self.device)
+        return EnsembleCritic(**kwargs, value_range=self.value_range, n_bins=self.n_bins).to(self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         super().set_training_mode(mode)
@@ -190,6 +196,7 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
         data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, leaky_slope=self.leaky_slope)
+        data.update(value_range=self.value_range, n_bins=self.n_bins)
         data.update(critic_engine=self.critic_engine, actor_averaging=self.actor_averaging)
         return data
 

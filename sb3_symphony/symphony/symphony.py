@@ -67,7 +67,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         the tanh: beyond (actions of 0.9) its gradient vanishes, and what drifted there stays. Smaller actions cost nothing:
         a pull toward zero teaches standing still (not a part of Symphony; Wang et al. 2020, "Striving for Simplicity and
         Performance in Off-Policy DRL", show that this is what SAC's entropy is for)
-    :param critic_loss: Error function of the critics: ``"rehe"``, ``"rehe_elementwise"``, ``"huber"`` or ``"mse"``
+    :param critic_loss: Error function of the critics: ``"rehe"``, ``"rehe_elementwise"``, ``"huber"`` or ``"mse"``;
+        ``"hl_gauss"`` for critics that classify, which need ``policy_kwargs`` with a ``value_range``
     :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
     :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
     :param episode_gradient_steps: Additional updates at the start of each episode
