@@ -204,13 +204,13 @@ def test_a_value_is_a_normal_distribution_over_the_bins(value):
 def test_values_are_those_expected():
     bins = ValueBins((-3, 3), n_bins=3).double()
     probabilities = th.tensor([[[0.2, 0.3, 0.5], [1 / 3] * 3]], dtype=th.float64)
-    assert bins(probabilities.log() + 7).flatten().tolist() == approx([0.6, 0.0])
+    assert bins.values(probabilities.log() + 7).flatten().tolist() == approx([0.6, 0.0])
 
 
 def test_far_from_the_ends_a_value_comes_back():
     bins = ValueBins((-60, 60)).double()
     values = th.linspace(-50, 50, 37, dtype=th.float64)[:, None]
-    th.testing.assert_close(bins(bins.probabilities(values).clamp_min(1e-300).log()), values, rtol=0, atol=1e-4)
+    th.testing.assert_close(bins.values(bins.probabilities(values).clamp_min(1e-300).log()), values, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -232,8 +232,8 @@ def test_slope_of_the_values_expected():
     bins = ValueBins((-3, 5), n_bins=7).double()
     logits = th.randn(2, 6, 7, dtype=th.float64, requires_grad=True)
     grad = th.randn(2, 6, 1, dtype=th.float64)
-    (slope,) = th.autograd.grad((bins(logits) * grad).sum(), logits)
-    th.testing.assert_close(bins.forward_slope(logits, grad), slope)
+    (slope,) = th.autograd.grad((bins.values(logits) * grad).sum(), logits)
+    th.testing.assert_close(bins.values_slope(logits, grad), slope)
 
 
 @pytest.mark.parametrize(

@@ -206,7 +206,7 @@ class EnsembleCritic(BaseModel):
         :return: ``(n_critics, batch, 1)``
         """
         outputs = self.outputs(obs, actions, members)
-        return outputs if self.bins is None else self.bins(outputs)
+        return outputs if self.bins is None else self.bins.values(outputs)
 
     def outputs(self, obs: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
         """What the networks give, before bins become a value: ``(n_critics, batch, 1 or n_bins)``; parameters as above."""

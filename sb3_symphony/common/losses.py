@@ -110,7 +110,8 @@ class ValueBins(nn.Module):
     Values as probabilities of bins, fitted by classification: HL-Gauss.
 
     A value stands for a normal distribution around it, cut into the bins. Regression to targets that move and are noisy is
-    easier in this form. Sources: Imani and White (2018), "Improving Regression Performance with Distributional Losses";
+    easier in this form. An objective of critics like :class:`~sb3_symphony.common.regression.Error`, whose outputs are logits.
+    Sources: Imani and White (2018), "Improving Regression Performance with Distributional Losses";
     Farebrother et al. (2024), "Stop Regressing: Training Value Functions via Classification for Scalable Deep RL", who take
     0.75 bins for its standard deviation.
 
@@ -136,14 +137,14 @@ class ValueBins(nn.Module):
         self.register_buffer("centers", ((edges[1:] + edges[:-1]) / 2)[:, None], persistent=False)
         self.scale = n_bins / (math.sqrt(2) * self.SIGMA * (high - low))
 
-    def forward(self, logits: th.Tensor) -> th.Tensor:
+    def values(self, logits: th.Tensor) -> th.Tensor:
         """
         :param logits: ``(n_critics, batch, n_bins)``
         :return: The values expected ``(n_critics, batch, 1)``
         """
         return logits.softmax(dim=-1) @ self.centers
 
-    def forward_slope(self, logits: th.Tensor, grad: th.Tensor) -> th.Tensor:
+    def values_slope(self, logits: th.Tensor, grad: th.Tensor) -> th.Tensor:
         """
         The gradient with respect to ``logits`` of what has the gradient ``grad (n_critics, batch, 1)`` with respect to the
         values expected.

@@ -71,17 +71,6 @@ class Error:
         return grad
 
 
-class Classification:
-    """
-    The objective of critics whose outputs are logits of bins: each finds the one of the target. Methods as in :class:`Error`.
-
-    :param bins: The bins
-    """
-
-    def __init__(self, bins: ValueBins) -> None:
-        self.loss, self.loss_slope, self.values, self.values_slope = bins.loss, bins.loss_slope, bins, bins.forward_slope
-
-
 class CriticRegression:
     """
     Steps the critics toward a target and their targets toward them, by plain autograd.
@@ -95,7 +84,7 @@ class CriticRegression:
 
     def __init__(self, critic: EnsembleCritic, critic_target: EnsembleCritic, loss: str, reduction: str) -> None:
         self.critic, self.critic_target = critic, critic_target
-        self.objective = Error(loss, reduction) if critic.bins is None else Classification(critic.bins)
+        self.objective = Error(loss, reduction) if critic.bins is None else critic.bins
         # Running statistics of batch normalisation (in features extractors) are copied, as in SB3
         self.running_stats = get_parameters_by_name(critic, ["running_"])
         self.running_stats_target = get_parameters_by_name(critic_target, ["running_"])
@@ -157,7 +146,7 @@ class _QValues(th.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, actions: th.Tensor, features: th.Tensor, network: FusedNetwork, objective: Error | Classification
+        ctx: Any, actions: th.Tensor, features: th.Tensor, network: FusedNetwork, objective: Error | ValueBins
     ) -> th.Tensor:
         ctx.network, ctx.objective, ctx.action_dim = network, objective, actions.shape[1]
         ctx.outputs = network.forward(features, actions)
