@@ -304,18 +304,13 @@ class _OnReturn(BaseCallback):
         if self.n_episodes > kept:
             raise ValueError(f"n_episodes={self.n_episodes!r}: expected at most the model's stats_window_size, {kept}")
 
-    def _on_step(self) -> bool:
-        if (recent := self._recent()) is not None:
-            self._follow(recent)
-        return True
-
     def _recent(self, *latest: float) -> float | None:
-        """The mean return, ``None`` before there are as many; ``latest`` are returns that the model has not noted yet."""
-        returns = [*(episode["r"] for episode in self.model.ep_info_buffer or ()), *latest]
-        return float(np.mean(returns[-self.n_episodes :])) if len(returns) >= self.n_episodes else None
-
-    def _follow(self, recent: float) -> None:
-        """What depends on the mean return, at each step."""
+        """The mean return, ``None`` before there are as many; ``latest`` is one that the model has not noted yet."""
+        noted = self.model.ep_info_buffer or ()
+        n_noted = self.n_episodes - len(latest)
+        if len(noted) < n_noted:
+            return None
+        return float(np.mean([*latest, *(noted[-k]["r"] for k in range(1, n_noted + 1))]))
 
 
 class QuietOnReturn(_OnReturn):
@@ -359,9 +354,11 @@ class QuietOnReturn(_OnReturn):
         super()._init_callback()
         self._noises()
 
-    def _follow(self, recent: float) -> None:
-        for noise in self._noises():
-            noise.independent = float(np.interp(recent, self.returns, self.independent))
+    def _on_step(self) -> bool:
+        if (recent := self._recent()) is not None:
+            for noise in self._noises():
+                noise.independent = float(np.interp(recent, self.returns, self.independent))
+        return True
 
 
 class _ScaledSchedule:
@@ -403,12 +400,14 @@ class SlowOnReturn(_OnReturn):
         check_pair("factors", factors, "before, after", 0, exclusive=True)
         self.factors = factors
 
-    def _follow(self, recent: float) -> None:
-        factor = float(np.exp(np.interp(recent, self.returns, np.log(self.factors))))
-        self.model._setup_lr_schedule()  # as they were given
-        for name in ("lr_schedule", "critic_lr_schedule"):  # Symphony's critics have their own
-            if hasattr(self.model, name):
-                setattr(self.model, name, FloatSchedule(_ScaledSchedule(getattr(self.model, name), factor)))
+    def _on_step(self) -> bool:
+        if (recent := self._recent()) is not None:
+            factor = float(np.exp(np.interp(recent, self.returns, np.log(self.factors))))
+            self.model._setup_lr_schedule()  # as they were given
+            for name in ("lr_schedule", "critic_lr_schedule"):  # Symphony's critics have their own
+                if hasattr(self.model, name):
+                    setattr(self.model, name, FloatSchedule(_ScaledSchedule(getattr(self.model, name), factor)))
+        return True
 
 
 class GreedyEpisodes(_OnReturn):

@@ -170,11 +170,17 @@ class ValueBins(nn.Module):
         :param weights: Importance weights ``(batch, 1)`` of a prioritised replay
         :return: The loss of each critic ``(n_critics,)``
         """
-        return _mean(-(self.probabilities(target) * logits.log_softmax(dim=-1)).sum(dim=-1, keepdim=True), weights)
+        return self._loss(logits, self.probabilities(target), weights)
 
-    def loss_slope(self, logits: th.Tensor, target: th.Tensor, weights: th.Tensor | None = None) -> th.Tensor:
-        """The derivative of the loss with respect to ``logits``."""
-        return _share(logits.softmax(dim=-1) - self.probabilities(target), weights)
+    def loss_and_slope(
+        self, logits: th.Tensor, target: th.Tensor, weights: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """The loss, and its derivative with respect to ``logits``."""
+        wanted = self.probabilities(target)
+        return self._loss(logits, wanted, weights), _share(logits.softmax(dim=-1) - wanted, weights)
+
+    def _loss(self, logits: th.Tensor, wanted: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+        return _mean(-(wanted * logits.log_softmax(dim=-1)).sum(dim=-1, keepdim=True), weights)
 
 
 CRITIC_LOSSES: dict[str, CriticLoss] = {"mse": mse, "huber": huber, "rehe": rehe, "rehe_elementwise": rehe_elementwise}

@@ -56,15 +56,16 @@ class Error:
         """
         return self._loss(self._error(outputs, target), weights)
 
-    def loss_slope(self, outputs: th.Tensor, target: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
-        """The derivative of the sum of losses with respect to ``outputs``."""
+    def loss_and_slope(self, outputs: th.Tensor, target: th.Tensor, weights: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
+        """The losses, and the derivative of their sum with respect to ``outputs``."""
         error = self._error(outputs, target)
         # d error / d outputs = -1, or -1 / n_critics where the error is that of their mean
-        return self._slope(error, weights).expand_as(outputs) * (-len(error) / len(outputs))
+        slope = self._slope(error, weights).expand_as(outputs) * (-len(error) / len(outputs))
+        return self._loss(error, weights), slope
 
     def values(self, outputs: th.Tensor) -> th.Tensor:
-        """The critics' values ``(n_critics, batch, 1)``, in memory of their own."""
-        return outputs.clone()
+        """The critics' values ``(n_critics, batch, 1)``, maybe in the same memory."""
+        return outputs
 
     def values_slope(self, outputs: th.Tensor, grad: th.Tensor) -> th.Tensor:
         """The gradient with respect to ``outputs`` of what has the gradient ``grad`` with respect to the values."""
@@ -150,7 +151,7 @@ class _QValues(th.autograd.Function):
     ) -> th.Tensor:
         ctx.network, ctx.objective, ctx.action_dim = network, objective, actions.shape[1]
         ctx.outputs = network.forward(features, actions)
-        return objective.values(ctx.outputs)
+        return objective.values(ctx.outputs).clone()
 
     @staticmethod
     @once_differentiable
@@ -189,10 +190,11 @@ class FusedRegression(CriticRegression):
             network = self._network(self.critic, len(actions))
             features = self.critic.extract_features(observations, self.critic.features_extractor)
             outputs = network.forward(features, actions)
-            network.backward(self.objective.loss_slope(outputs, target, weights))
-            fit = Fit(self.objective.loss(outputs, target, weights).sum(), self.objective.values(outputs))
+            q_values = self.objective.values(outputs).clone()
+            loss, slope = self.objective.loss_and_slope(outputs, target, weights)
+            network.backward(slope)
             self._step(network, tau)
-            return fit
+            return Fit(loss.sum(), q_values)
 
     def q_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
         with th.no_grad():

@@ -87,8 +87,9 @@ class REDQPolicy(AveragedActor, SACPolicy):
         check_number("actor_averaging", actor_averaging, 0, 1)
         check_net_arch(net_arch)  # before the parent, which builds the actor
         self.critic_engine = critic_engine
-        self.value_range, self.n_bins = value_range, n_bins  # used by the parent, which builds the networks
-        self.layer_norm, self.dropout_rate = layer_norm, dropout_rate  # before the parent, which builds the networks
+        # Before the parent, which builds the networks
+        self.layer_norm, self.dropout_rate = layer_norm, dropout_rate
+        self.value_range, self.n_bins = value_range, n_bins
         super().__init__(
             observation_space,
             action_space,

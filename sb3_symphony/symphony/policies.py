@@ -135,8 +135,9 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
         check_choice("critic_engine", critic_engine, ENGINES)
         check_number("actor_averaging", actor_averaging, 0, 1)
         self.critic_engine = critic_engine
-        self.value_range, self.n_bins = value_range, n_bins  # used by the parent, which builds the networks
-        self.layer_norm, self.dropout_rate, self.leaky_slope = layer_norm, dropout_rate, leaky_slope  # used by the parent
+        # Before the parent, which builds the networks
+        self.layer_norm, self.dropout_rate, self.leaky_slope = layer_norm, dropout_rate, leaky_slope
+        self.value_range, self.n_bins = value_range, n_bins
         super().__init__(
             observation_space,
             action_space,
