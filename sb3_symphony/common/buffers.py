@@ -425,6 +425,9 @@ class SumTree:
     """
 
     def __init__(self, n_leaves: int) -> None:
+        self._allocate(n_leaves)
+
+    def _allocate(self, n_leaves: int) -> None:
         self.n_leaves = n_leaves
         self.first_leaf = 1 << max(n_leaves - 1, 0).bit_length()  # a power of two, so all leaves have the same depth
         self.nodes = np.zeros(2 * self.first_leaf)
@@ -436,7 +439,7 @@ class SumTree:
         return {"n_leaves": self.n_leaves, "values": self.nodes[self.first_leaf : end]}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(state["n_leaves"])  # type: ignore[misc]  # no subclass, whose own it would be
+        self._allocate(state["n_leaves"])
         self.nodes[self.first_leaf : self.first_leaf + len(state["values"])] = state["values"]
         level = self.first_leaf
         while level > 1:  # the same sums as in set(), hence the same bits

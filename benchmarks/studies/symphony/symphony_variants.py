@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import polyak_update, update_learning_rate
@@ -119,7 +120,7 @@ class MinMaxExtractor(BaseFeaturesExtractor):
     """
 
     def __init__(self, observation_space: gym.Space) -> None:
-        super().__init__(observation_space, features_dim=observation_space.shape[0])  # type: ignore[index]  # a vector
+        super().__init__(observation_space, features_dim=get_flattened_obs_dim(observation_space))
         self.register_buffer("low", th.full((self.features_dim,), -2.0))
         self.register_buffer("high", th.full((self.features_dim,), 2.0))
 
