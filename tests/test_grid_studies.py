@@ -161,6 +161,16 @@ def test_search(study):
     config = yaml.safe_load((run / "Pendulum-v1" / "config.yml").read_text())
     assert config["learning_rate"] == found["learning_rate"] in (1e-3, 1e-4)
     assert config["policy_kwargs"] == {"net_arch": [8]}
+    table = (study / "results" / "table.md").read_text()
+    assert "### Search: rate\n\n2 of 2 trials (2 completed), " in table and "| trial | mean return |" in table
+
+
+def test_report_of_a_search_alone(study, tmp_path, capsys):
+    """Before its best settings are trained."""
+    shutil.copytree(study / "results" / "sweeps", tmp_path / "results" / "sweeps")
+    assert main(["bench", str(study / "study.yml"), "--report", "-f", str(tmp_path / "results")]) == 0
+    printed = capsys.readouterr().out
+    assert "2 of 2 trials" in printed and "not run yet" in printed
 
 
 def test_figures(study, capsys):

@@ -19,7 +19,7 @@ from sb3_symphony.cli import main
 from sb3_symphony.experiment import tune as tune_module
 from sb3_symphony.experiment.config import ConfigError, RunConfig
 from sb3_symphony.experiment.space import TuneOptions
-from sb3_symphony.experiment.sweep_report import PLAN, SweepReport, reason_of
+from sb3_symphony.experiment.sweep_report import PLAN, SweepReport, reason_of, trials_table
 from sb3_symphony.experiment.sweep_storage import JournalSweep, open_storage
 from sb3_symphony.experiment.trial import TrialFailed
 from sb3_symphony.experiment.tune import RETRIES, ProgramError, tune
@@ -513,3 +513,43 @@ def test_wrong_flags(capsys, flags, message):
         status = error.code
     err = capsys.readouterr().err
     assert status == 2 and err.count("\n") == 1 and message in err
+
+
+TRIALS = """\
+number,state,value,reason,retry_of,evaluations,started,seconds,worker,seed_100,normalize,learning_rate,noise_type
+0,fail,,its process died,,1,2026-01-01,600,a,,False,0.00012345678,normal
+1,complete,-3.5,,,4,2026-01-01,1800,a,-3.5,False,0.5,normal
+2,complete,7.25,,0,4,2026-01-01,1200,a,7.25,False,0.00012345678,normal
+3,pruned,1.0,,,2,2026-01-01,600,a,1.0,False,1e-05,pink
+4,complete,7.25,,,4,2026-01-01,1800,a,7.25,False,2.0,pink
+5,running,,,,1,2026-01-01,,a,,False,3.0,pink
+"""
+
+
+def test_a_table_of_trials_on_a_page(tmp_path):
+    """The trial that was tried again counts once; the earliest of equals first; what all have in common is no column."""
+    (tmp_path / "trials.csv").write_text(TRIALS)
+    assert trials_table("rates", tmp_path / "trials.csv", 10, n_best=2).splitlines() == [
+        "### Search: rates",
+        "",
+        "4 of 10 trials (3 completed, 1 pruned, 1 running), 1.5 hours one after the other. The best:",
+        "",
+        "| trial | mean return | learning_rate | noise_type |",
+        "|-------|------------:|--------------:|-----------:|",
+        "| 2     |        7.25 |     0.0001235 |     normal |",
+        "| 4     |        7.25 |             2 |       pink |",
+    ]
+    assert trials_table("rates", tmp_path / "none.csv", 10) == "### Search: rates\n\nNot run yet.\n"
+    (tmp_path / "trials.csv").write_text("\n".join(TRIALS.splitlines()[:2]))
+    assert trials_table("rates", tmp_path / "trials.csv", 10).endswith(
+        "1 of 10 trials (1 failed), 0.2 hours one after the other.\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "damaged", ["number,state\n0,complete\n", TRIALS.replace("pruned", "cut"), TRIALS.replace("7.25", "x")]
+)
+def test_no_table_of_trials(damaged, tmp_path):
+    (tmp_path / "trials.csv").write_text(damaged)
+    with pytest.raises(ConfigError, match=r"trials.csv': no table of trials — \w+Error"):
+        trials_table("rates", tmp_path / "trials.csv", 10)

@@ -120,7 +120,7 @@ def bench(options: BenchOptions) -> BenchResult:
     if options.report:
         from sb3_symphony.experiment.output import output_folder, write_output
 
-        if not any(each.run.path.is_dir() for each in progress):
+        if not any(each.run.path.is_dir() for each in progress) and not (folder / "sweeps").is_dir():
             raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
         table = report(study, progress, folder)
         if options.page is not None:

@@ -11,7 +11,7 @@ from sb3_symphony.experiment.cell import read_result
 from sb3_symphony.experiment.config import ConfigError, read_yaml
 from sb3_symphony.experiment.grid_progress import Progress
 from sb3_symphony.experiment.run_folder import RunFolder
-from sb3_symphony.experiment.study import Drawing, Environment, Study
+from sb3_symphony.experiment.study import Drawing, Environment, Study, sweep_options
 
 if TYPE_CHECKING:
     from sb3_symphony.analysis.runs import Run, Scalar
@@ -127,6 +127,7 @@ def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:
             tables += [matrix_table(some, names, study.matrix.label) for some in by_environment]
             entries = matrix_rows(results)
             files["matrix.csv"] = as_csv(entries[0], entries) if entries else ""
+        tables += _searches(study, folder)
         table = "\n".join([f"## {study.title}", "", *tables])
         for name, content in {"table.md": table, **files}.items():
             write_atomically(folder / name, content.encode())
@@ -139,6 +140,16 @@ def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:
     except OSError as error:
         raise ConfigError(f"'{error.filename or folder}' cannot be written — {error.strerror}") from None
     return table
+
+
+def _searches(study: Study, folder: Path) -> list[str]:
+    """Tables of the study's searches."""
+    if not study.sweeps:
+        return []
+    from sb3_symphony.experiment.sweep_report import trials_table  # Optuna takes a second
+
+    options = {name: sweep_options(study, name, folder, folder) for name in study.sweeps}
+    return [trials_table(name, sweep.folder / "trials.csv", sweep.n_trials) for name, sweep in options.items()]
 
 
 def result_of(progress: Progress) -> "Result":

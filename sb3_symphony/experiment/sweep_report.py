@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -13,6 +14,7 @@ import optuna
 import yaml
 from optuna.trial import FrozenTrial, TrialState
 
+from sb3_symphony.analysis.tables import aligned
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge
 from sb3_symphony.experiment.space import parse_space
@@ -201,3 +203,47 @@ class SweepReport:
 
 def _cell(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, list | dict) else value
+
+
+_STATES = {"complete": "completed", "pruned": "pruned", "fail": "failed", "running": "running", "waiting": "waiting"}
+_ABOUT = re.compile(r"number|state|value|reason|retry_of|evaluations|started|seconds|worker|seed_\d+")
+
+
+def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
+    """
+    A search on a page, from the table that :meth:`SweepReport.write` has left.
+
+    :param name: name of the search
+    :param path: its ``trials.csv``, which need not be there yet
+    :param n_trials: how many trials it is to have
+    :param n_best: how many of the best are shown
+    :return: heading, what became of the trials, and the best ones with what differs between trials
+    :raises ConfigError: if that is no table of trials
+    """
+    heading = f"### Search: {name}\n\n"
+    if not path.is_file():
+        return f"{heading}Not run yet.\n"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        again = {row["retry_of"] for row in rows}
+        rows = [row for row in rows if row["number"] not in again]
+        counts = Counter(_STATES[row["state"]] for row in rows)
+        hours = sum(float(row["seconds"] or 0) for row in rows) / 3600
+        completed = [(-float(row["value"]), int(row["number"]), row) for row in rows if row["state"] == "complete"]
+    except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
+        raise ConfigError(f"'{path}': no table of trials — {type(error).__name__}: {error}") from None
+    ended = sum(counts[state] for state in ("completed", "pruned", "failed"))
+    states = ", ".join(f"{counts[state]} {state}" for state in _STATES.values() if counts[state])
+    summary = f"{ended} of {n_trials} trials ({states}), {hours:.1f} hours one after the other."
+    if not completed:
+        return f"{heading}{summary}\n"
+    names = [column for column in rows[0] if not _ABOUT.fullmatch(column) and len({row[column] for row in rows}) > 1]
+    table = [["trial", "mean return", *names]]
+    for value, number, row in sorted(completed)[:n_best]:
+        table.append([str(number), f"{-value:.2f}", *(_short(row[column]) for column in names)])
+    return "\n".join([f"{heading}{summary} The best:", "", *aligned(table), ""])
+
+
+def _short(cell: str) -> str:
+    return f"{float(cell):.4g}" if re.fullmatch(r"-?\d*\.\d+(e-?\d+)?", cell) else cell
