@@ -27,6 +27,11 @@ REASON, ENDED, RETURNS = "reason", "ended", "returns"
 
 _FIGURES = ("optimization_history", "intermediate_values", "param_importances", "slice", "parallel_coordinate", "timeline")
 
+# States of trials in the order they are told, and their words
+_STATES = {"complete": "completed", "pruned": "pruned", "fail": "failed", "running": "running", "waiting": "waiting"}
+# Columns of ``SweepReport.rows`` that are no hyper-parameters
+_ABOUT = re.compile(r"number|state|value|reason|retry_of|evaluations|started|seconds|worker|seed_\d+")
+
 
 def reason_of(trial: FrozenTrial) -> str:
     """
@@ -173,15 +178,7 @@ class SweepReport:
         """:return: state, best trials and where the files are, for the terminal"""
         trials = self.study.get_trials(deepcopy=False)
         again = replaced(trials)
-        counts = Counter(trial.state for trial in trials)
-        words = {
-            TrialState.COMPLETE: "completed",
-            TrialState.PRUNED: "pruned",
-            TrialState.FAIL: "failed",
-            TrialState.RUNNING: "running",
-            TrialState.WAITING: "waiting",
-        }
-        states = ", ".join(f"{counts[state]} {word}" for state, word in words.items() if counts[state]) or "none"
+        states = _told([trial.state.name.lower() for trial in trials]) or "none"
         lines = [f"{self.study.study_name}: {len(trials)} trials ({states}; {len(again)} of them tried again)"]
         lines[0] = lines[0] if again else lines[0].replace("; 0 of them tried again", "")
         reasons = Counter(reason_of(trial) for trial in trials if trial.state == TrialState.FAIL)
@@ -205,10 +202,6 @@ def _cell(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, list | dict) else value
 
 
-_STATES = {"complete": "completed", "pruned": "pruned", "fail": "failed", "running": "running", "waiting": "waiting"}
-_ABOUT = re.compile(r"number|state|value|reason|retry_of|evaluations|started|seconds|worker|seed_\d+")
-
-
 def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
     """
     A search on a page, from the table that :meth:`SweepReport.write` has left.
@@ -228,14 +221,14 @@ def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
             rows = list(csv.DictReader(file))
         again = {row["retry_of"] for row in rows}
         rows = [row for row in rows if row["number"] not in again]
-        counts = Counter(_STATES[row["state"]] for row in rows)
+        states = [row["state"] for row in rows]
+        told = _told(states)
         hours = sum(float(row["seconds"] or 0) for row in rows) / 3600
         completed = [(-float(row["value"]), int(row["number"]), row) for row in rows if row["state"] == "complete"]
     except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
         raise ConfigError(f"'{path}': no table of trials — {type(error).__name__}: {error}") from None
-    ended = sum(counts[state] for state in ("completed", "pruned", "failed"))
-    states = ", ".join(f"{counts[state]} {state}" for state in _STATES.values() if counts[state])
-    summary = f"{ended} of {n_trials} trials ({states}), {hours:.1f} hours one after the other."
+    ended = sum(state in ("complete", "pruned", "fail") for state in states)
+    summary = f"{ended} of {n_trials} trials ({told}), {hours:.1f} hours one after the other."
     if not completed:
         return f"{heading}{summary}\n"
     names = [column for column in rows[0] if not _ABOUT.fullmatch(column) and len({row[column] for row in rows}) > 1]
@@ -243,6 +236,12 @@ def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
     for value, number, row in sorted(completed)[:n_best]:
         table.append([str(number), f"{-value:.2f}", *(_short(row[column]) for column in names)])
     return "\n".join([f"{heading}{summary} The best:", "", *aligned(table), ""])
+
+
+def _told(states: list[str]) -> str:
+    """How many trials are in which state, in words."""
+    counts = Counter(_STATES[state] for state in states)
+    return ", ".join(f"{counts[word]} {word}" for word in _STATES.values() if counts[word])
 
 
 def _short(cell: str) -> str:
