@@ -183,7 +183,7 @@ def test_values_for_the_actor_and_the_target(activation_fn, net_arch, layer_norm
         run(fitter, 3)
         observations, actions, weights = batch_of(24, seed=9)
         results.append([])
-        for members in (None, [2, 0], [1]):
+        for members in (None, [2, 0], [1], [3, 1, 0, 2]):
             q_values = fitter.target_q_values(observations, actions, members)
             assert q_values.shape == (4 if members is None else len(members), 24, 1) and not q_values.requires_grad
             results[-1].append(q_values.clone())

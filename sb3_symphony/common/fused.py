@@ -88,6 +88,7 @@ class Products:
 
     def __init__(self, weight: th.Tensor) -> None:
         self.weight = weight
+        self.all_members = np.arange(len(weight))
 
     def forward(self, x: th.Tensor, members: np.ndarray, out: th.Tensor) -> None:
         """
@@ -95,7 +96,7 @@ class Products:
         :param members: Indices ``(n,)`` of the networks to compute
         :param out: Where to write the result ``(n, batch, width)``
         """
-        if len(members) == len(self.weight):
+        if np.array_equal(members, self.all_members):  # all, and in this order
             th.bmm(x, self.weight, out=out)
         else:  # one by one, rather than gather the weights first
             for k, each, result in zip(members.tolist(), x, out, strict=True):
@@ -140,7 +141,7 @@ class BFloat16Products(Products):
         n = len(members)
         rounded_x, weight, product = self.operands[0][:n], self.operands[1][:n], self.results[2][:n]
         rounded_x.copy_(x)
-        if n == len(self.weight):
+        if np.array_equal(members, self.all_members):
             weight.copy_(self.weight)
         else:
             for k, each in zip(members.tolist(), weight, strict=True):
@@ -283,7 +284,7 @@ class WideOutput(Layer):
         self.input = x.expand(n, -1, -1)
         out = self.out[:n]
         self.products.forward(self.input, members, out)
-        return out.add_(self.bias if n == len(self.bias) else self.bias[members])
+        return out.add_(self.bias[members])
 
     def backward(self, grad: th.Tensor, grad_input: th.Tensor) -> None:
         th.sum(grad, dim=1, keepdim=True, out=self.grads[1])

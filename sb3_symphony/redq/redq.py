@@ -273,7 +273,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             return None
         size = int(self.subset_size)
         size += int(np.random.random() < float(self.subset_size) - size)
-        return np.random.permutation(self.n_critics)[:size].tolist()
+        return None if size == self.n_critics else np.random.permutation(self.n_critics)[:size].tolist()
 
     def learn(
         self: SelfREDQ,
