@@ -100,6 +100,39 @@ def test_run_from_a_trained_agent(folder):
     assert len(list((folder / "logs" / "td3").iterdir())) == 2
 
 
+@pytest.mark.parametrize("algo", ["td3", "redq"])
+def test_random_numbers_are_those_of_the_own_seed(algo):
+    first = train(options(algo)).run
+    draws = []
+    for seed in (2, 3):
+        chosen = options(algo, trained_agent=str(first.path))
+        model = build_model(chosen, load_config(chosen), seed, verbose=0)
+        start_from(model, find_trained(chosen), False)
+        draws.append((th.rand(1).item(), np.random.rand()))
+        th.manual_seed(seed)
+        np.random.seed(seed)
+        assert draws[-1] == (th.rand(1).item(), np.random.rand())
+    assert draws[0] != draws[1]
+
+
+@pytest.mark.parametrize("algo", ["symphony", "droq"])
+def test_the_average_of_actors_starts_anew(algo):
+    small = {**SMALL, "policy_kwargs": {"net_arch": [8], "actor_averaging": 0.1}}
+    first = train(options(algo, hyperparams=small)).run
+    model, trained = started(options(algo, hyperparams=small, trained_agent=str(first.path)))
+    assert trained.policy.n_averaged > 10 and model.policy.n_averaged == 0
+    assert same(model.policy.averaged_actor.state_dict(), trained.actor.state_dict())
+    model.policy.average_actor()
+    assert same(model.policy.averaged_actor.state_dict(), model.actor.state_dict())
+
+
+def test_symphony_does_not_redraw_a_trained_actor():
+    first = train(options("symphony")).run
+    model, trained = started(options("symphony", trained_agent=str(first.path)))
+    model.learn(model.learning_starts)
+    assert model._n_updates == 0 and same(model.actor.state_dict(), trained.actor.state_dict())
+
+
 def test_a_fixed_entropy_coefficient_stays_fixed():
     first = train(options("sac")).run
     model, _ = started(options("sac", trained_agent=str(first.path), hyperparams={**SMALL, "ent_coef": 0.005}))

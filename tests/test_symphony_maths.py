@@ -359,6 +359,22 @@ def test_no_redraw_after_warm_up(pendulum):
     assert not th.equal(watch.actors[0]["mu.0.weight"], watch.actors[10]["mu.0.weight"])
 
 
+def test_no_redraw_of_an_actor_that_another_model_has_trained(pendulum):
+    trained = short_model(pendulum(1, 10)).learn(30)
+    model = short_model(pendulum(1, 10), learning_starts=35)
+    model.set_parameters(trained.get_parameters())
+    model.learn(35)
+    assert model._n_updates == 0
+    assert all(th.equal(value, trained.actor.state_dict()[name]) for name, value in model.actor.state_dict().items())
+
+
+def test_who_is_evaluated_during_the_warm_up_is_who_acts(pendulum):
+    model = short_model(pendulum(1, 10), learning_starts=35, policy_kwargs={"net_arch": [8], "actor_averaging": 0.3}).learn(35)
+    observations = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    one, other = (model.predict(observations, deterministic=deterministic)[0] for deterministic in (True, False))
+    assert np.array_equal(one, other)
+
+
 def test_uniform_warm_up_does_not_redraw(pendulum):
     model = short_model(pendulum(1, 10), learning_starts=35, warmup_policy="uniform")
     start = {name: value.clone() for name, value in model.actor.named_parameters()}

@@ -12,7 +12,8 @@ class AveragedActor(BasePolicy):
     """
     Mixin, in front of SB3's ``SACPolicy`` or ``TD3Policy``: ``predict(..., deterministic=True)`` asks an average of
     the actor's weights over the last part of its updates, which walks more evenly than each of them. The part grows with the
-    training. Training never asks it: with or without, the trained actor and the critics are the same.
+    training. Training asks it in greedy episodes alone (:class:`~sb3_symphony.common.callbacks.GreedyEpisodes`): without
+    those, the trained actor and the critics are the same as without an average.
 
     The t-th actor enters with weight 1 / (part · t), at most 1: for large t the polynomial-decay averaging of Shamir & Zhang
     (2013), "Stochastic Gradient Descent for Non-smooth Optimization", with η = 1 / part - 1. For policies: Nikishin et al.
@@ -38,6 +39,12 @@ class AveragedActor(BasePolicy):
             self.averaged_actor.set_training_mode(False)  # for good: it only predicts
             del self.averaged_actor.optimizer
             self.register_buffer("n_averaged", th.zeros((), dtype=th.long, device=self.device))
+
+    def restart_average(self) -> None:
+        """Forget all actors but the present one; to be called when it is given other weights than an update's."""
+        if self.averaged_actor is not None:
+            self.n_averaged.zero_()
+            self.averaged_actor.load_state_dict(self.actor.state_dict())
 
     def average_actor(self) -> None:
         """Move the average toward the actor; to be called after each of its updates."""

@@ -10,8 +10,10 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.save_util import load_from_pkl, recursive_getattr
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
+from sb3_symphony.common.averaging import AveragedActor
 from sb3_symphony.common.checkpoint import newest_checkpoint
 from sb3_symphony.common.files import DamagedFile
 from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
@@ -71,6 +73,7 @@ def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: b
         raise ConfigError(f"-i: {error}") from None
     check_match(trained, env, selection)
     _take_networks(model, trained, selection)
+    set_random_seed(model.seed)  # loading has left the trained one's
     if normalization is not None and selection.normalization is not None:
         stored = load_normalization(selection.normalization, normalization.venv)
         normalization.obs_rms, normalization.ret_rms = stored.obs_rms, stored.ret_rms
@@ -98,6 +101,8 @@ def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, selection: Sele
             f"-i: networks of {selection.model} (policy_kwargs {trained.policy_kwargs}) do not fit the configuration's "
             f"({model.policy_kwargs}) — {what}"
         ) from None
+    if isinstance(model.policy, AveragedActor):
+        model.policy.restart_average()  # its count of updates came along
     known = set(trained._get_torch_save_params()[1]) - {"ent_coef_tensor"}  # which the configuration fixes
     for name in known & set(tensors):
         recursive_getattr(model, name).data.copy_(recursive_getattr(trained, name))

@@ -50,7 +50,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16: less precise, and up to 1.6 times as fast where networks are large and the processor has it
     :param actor_averaging: Above 0, ``predict(..., deterministic=True)`` asks an average of the actor's weights over about
-        this part of its updates so far (0.125: the last eighth); training is the same with and without
+        this part of its updates so far (0.125: the last eighth); training is the same without, but for ``GreedyEpisodes``
     """
 
     # Another class of critics than SB3's annotation
