@@ -23,7 +23,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_symphony import REDQ, DroQ, Symphony
 from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
-from sb3_symphony.common.noise import DecayingNormalActionNoise
+from sb3_symphony.common.noise import DecayingNormalActionNoise, StickyActionNoise
 
 TIME = {"time/episodes", "time/fps", "time/time_elapsed", "time/total_timesteps"}
 ROLLOUT = {"rollout/ep_rew_mean", "rollout/ep_len_mean"}
@@ -134,21 +134,26 @@ def test_no_actor_loss_without_actor_update(make):
 @pytest.mark.parametrize("n_envs", [1, 2, 3])
 @pytest.mark.parametrize("train_freq, gradient_steps, ratio", [(1, 1, 1.0), (1, 6, 6.0), (4, 6, 1.5), (2, -1, None)])
 def test_update_ratio(make, algorithm, n_envs, train_freq, gradient_steps, ratio):
-    """Updates per transition. The first call after the warm-up is not typical, its transitions were collected before."""
+    """Updates per transition since the log was written. The first call after the warm-up is not typical."""
     record = Record()
     model = make(n_envs=n_envs, train_freq=train_freq, gradient_steps=gradient_steps, **no_extra_updates(algorithm))
-    model.learn(96, callback=record, log_interval=None)
+    model.learn(48, log_interval=None)
+    model.dump_logs()
+    model.learn(60, callback=record, log_interval=None, reset_num_timesteps=False)
     expected = 1.0 if ratio is None else ratio / n_envs
     assert len(record.values) > 3
-    assert [values["train/update_ratio"] for values in record.values[1:]] == pytest.approx([expected] * len(record.values[1:]))
+    assert [values["train/update_ratio"] for values in record.values] == pytest.approx([expected] * len(record.values))
 
 
-def test_update_ratio_counts_all_updates(small):
-    record = Record()
-    small(Symphony, initial_gradient_steps=(0, 0), episode_gradient_steps=7).learn(60, callback=record, log_interval=None)
-    ratios = {21 + i: values["train/update_ratio"] for i, values in enumerate(record.values)}
-    assert [ratios[step] for step in (25, 50)] == [8.0, 8.0]  # an episode begins
-    assert {ratio for step, ratio in ratios.items() if step not in (21, 25, 50)} == {1.0}
+def test_update_ratio_counts_all_updates(small, tmp_path):
+    """Each line of the log those since the line before: 25 calls, one of them at an episode's start."""
+    model = small(Symphony, initial_gradient_steps=(0, 0), episode_gradient_steps=7)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(100, log_interval=1)
+    header, *rows = (line.split(",") for line in (tmp_path / "progress.csv").read_text().splitlines())
+    ratios, updates = ([float(row[header.index(f"train/{key}")]) for row in rows] for key in ("update_ratio", "n_updates"))
+    assert ratios == pytest.approx([1.0, 32 / 25, 32 / 25, 32 / 25])
+    assert np.diff(updates).tolist() == [32, 32, 32]
 
 
 def test_update_ratio_after_a_second_learn(make, algorithm):
@@ -167,6 +172,7 @@ def test_update_ratio_after_a_second_learn(make, algorithm):
         (None, 0.0),
         (NormalActionNoise(np.zeros(1), 0.2 * np.ones(1)), 0.2),
         (DecayingNormalActionNoise(1, sigma=0.4, decay_steps=100, decay="linear"), 0.16),
+        (StickyActionNoise(1, sigma=0.3, decay="constant", episode_scale=(0, 1), independent=0.2), (0.03 + 0.04) ** 0.5),
     ],
     ids=str,
 )

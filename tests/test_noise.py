@@ -54,6 +54,30 @@ def test_decay_to_a_final_value(decay, expected):
         assert noise.sigma_t == pytest.approx(value)
 
 
+@pytest.mark.parametrize(
+    "noise",
+    [
+        DecayingNormalActionNoise(4, sigma=0.3, decay="constant", clip=None),
+        PinkActionNoise(4, sigma=0.3, decay="constant", block_steps=20),
+        StickyActionNoise(4, sigma=0.3, decay="constant", hold=3),
+        StickyActionNoise(4, sigma=0.3, decay="constant", episode_scale=(0, 1.5), independent=0.2),
+        StickyActionNoise(4, sigma=0.3, sigma_final=0.03, decay_steps=1, episode_scale=(0.5, 1), independent=(0.1, 0.4, 0, 1)),
+    ],
+    ids=str,
+)
+def test_standard_deviation_that_is_told(noise):
+    np.random.seed(0)
+    drawn = []
+    for _ in range(1500):  # episodes
+        noise.reset()
+        drawn += [noise() for _ in range(20)]
+    assert np.std(drawn[20:]) == pytest.approx(noise.std, rel=0.03)
+
+
+def test_standard_deviation_that_is_not_known():
+    assert np.isnan(DisturbanceActionNoise(2).std)
+
+
 @pytest.mark.parametrize("noise_class", ALL)
 def test_calls_count_and_reset_does_not(noise_class):
     np.random.seed(0)

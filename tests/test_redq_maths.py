@@ -461,3 +461,11 @@ def test_dropout_is_active_in_the_actor_loss(engine):
     assert not th.equal(model._regression.q_values(*x), model._regression.q_values(*x))
     model.policy.set_training_mode(False)
     assert th.equal(model._regression.q_values(*x), model._regression.q_values(*x))
+
+
+def test_gsde_draws_noise_for_each_update():
+    model, _ = model_with_data(use_sde=True, gradient_steps=20, policy_delay=20)
+    calls, reset = [], model.actor.reset_noise
+    model.actor.reset_noise = lambda *args: (calls.append(1), reset(*args))
+    model.train(gradient_steps=20, batch_size=16)
+    assert len(calls) == 20 + 1  # and one for the actor's

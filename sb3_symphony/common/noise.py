@@ -65,7 +65,7 @@ class DecayingActionNoise(ActionNoise):
 
     @property
     def sigma_t(self) -> float:
-        """Standard deviation of the next draw, in scaled action units."""
+        """σ_t of the next draw, in scaled action units."""
         progress = self.t / self.decay_steps
         if self.decay == "constant":
             remaining = 1.0
@@ -78,6 +78,11 @@ class DecayingActionNoise(ActionNoise):
         else:
             remaining = 0.5 * (1.0 + math.cos(math.pi * progress))
         return self.sigma_final + (self.sigma - self.sigma_final) * remaining
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the next draw, over all episodes; NaN where it is not known."""
+        return self.sigma_t
 
     def __call__(self) -> np.ndarray:
         """
@@ -192,6 +197,12 @@ class StickyActionNoise(DecayingActionNoise):
         self.episode_scale = episode_scale
         self.independent = independent
         self.reset()
+
+    @property
+    def std(self) -> float:
+        smallest, largest = self.episode_scale
+        square = (smallest**2 + smallest * largest + largest**2) / 3  # mean of the uniform factor's
+        return math.hypot(self.sigma_t * math.sqrt(square), at_step(self.independent, self.t))
 
     def reset(self) -> None:
         """Start a new episode: forget the last draw (the decay goes on)."""
@@ -329,6 +340,10 @@ class DisturbanceActionNoise(DecayingActionNoise):
         check_number("sigma_final", sigma_final, 0, 2)
         self.clock = 0.0
         self.reset()
+
+    @property
+    def std(self) -> float:
+        return math.nan
 
     def reset(self) -> None:
         """Start a new episode: new phases, d = 0 (clock and decay go on)."""

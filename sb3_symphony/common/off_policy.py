@@ -111,6 +111,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self.critic_loss = critic_loss
         self.critic_reduction = critic_reduction
         self._timesteps_at_update = 0
+        self._logged_updates = self._logged_transitions = 0  # since the log was written
         self._was_set_up = False  # in a saved model: True
 
     def _check_arguments(self) -> None:
@@ -244,10 +245,30 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             while start < draw:
                 until_actor = self.policy_delay - self._n_updates % self.policy_delay
                 length = min(draw - start, until_actor, max(1, MAX_SEGMENT_ROWS // batch_size))
+                if self.use_sde:  # each update has noise of its own, as in SAC
+                    length = 1
                 batches = [_rows(samples, (start + i) * batch_size, batch_size) for i in range(length)]
                 yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
             gradient_steps -= draw
+
+    def _fit_critics(self, batch: ReplayBufferSamples, target: th.Tensor, logs: dict[str, list[th.Tensor]]) -> None:
+        """
+        One step of the critics, after which the targets move.
+
+        :param batch: The transitions
+        :param target: What their values are to be ``(batch, 1)``
+        :param logs: Where to add what is logged
+        """
+        weights = getattr(batch, "weights", None)
+        loss, q_values = self._regression.fit(batch.observations, batch.actions, target, self.tau, weights)
+        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
+            # Priority of a transition: its error averaged over the critics. Samples of this buffer alone have indices
+            self.replay_buffer.update_priorities(batch.indices, (target - q_values).abs().mean(dim=0))  # type: ignore[attr-defined]
+        self._n_updates += 1
+        logs["critic_loss"].append(loss)
+        logs["q_values"].append(q_values)
+        logs["target_q_mean"].append(target)
 
     def _step_actor(self, loss: th.Tensor) -> None:
         """One step of the actor. No gradient reaches the critics, nor what is frozen."""
@@ -255,20 +276,14 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         loss.backward(inputs=[parameter for parameter in self.actor.parameters() if parameter.requires_grad])
         self.actor.optimizer.step()
 
-    def _update_priorities(self, batch: ReplayBufferSamples, target: th.Tensor, q_values: th.Tensor) -> None:
-        """Priority of a transition: its error averaged over the critics. Nothing to do for other buffers."""
-        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
-            error = (target - q_values).abs().mean(dim=0)  # (batch, 1)
-            # Samples of this buffer, and of no other, have indices
-            self.replay_buffer.update_priorities(batch.indices, error.flatten().cpu().numpy())  # type: ignore[attr-defined]
-
     def _discounts(self, batch: ReplayBufferSamples) -> th.Tensor | float:
         """Discount of the bootstrap value: ``gamma`` to the power of the steps summed in ``rewards``."""
         return self.gamma if batch.discounts is None else batch.discounts
 
     def _log_update(self, n_updates_before: int, logs: dict[str, list[th.Tensor]], noise_std: th.Tensor | float) -> None:
         """
-        Record the mean of each quantity over the updates of one ``train()`` call: the only transfer off the device.
+        Record the mean of each quantity over the updates of one ``train()`` call: the only transfer off the device; and the
+        ratio of updates to environment steps since the log was written.
 
         :param n_updates_before: ``_n_updates`` when the call began
         :param logs: Log key (without ``train/``) to tensors of one shape, one per update. ``q_values``
@@ -288,10 +303,16 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
         if self.num_timesteps < self._timesteps_at_update:  # learn() was called anew and the count restarted
             self._timesteps_at_update = 0
-        transitions = max(1, self.num_timesteps - self._timesteps_at_update)
+        # Steps of the warm-up have no updates
+        self._logged_transitions += max(1, self.num_timesteps - max(self._timesteps_at_update, self.learning_starts))
         self._timesteps_at_update = self.num_timesteps
-        self.logger.record("train/update_ratio", (self._n_updates - n_updates_before) / transitions)
+        self._logged_updates += self._n_updates - n_updates_before
+        self.logger.record("train/update_ratio", self._logged_updates / self._logged_transitions)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def dump_logs(self) -> None:
+        super().dump_logs()
+        self._logged_updates = self._logged_transitions = 0
 
     # ---------------------------------------------------------------- saving
 
@@ -317,10 +338,10 @@ def noise_std(action_noise: ActionNoise | None) -> float:
     """
     Current standard deviation of an action noise, averaged over its dimensions and environments.
 
-    :param action_noise: SB3's or one of :mod:`sb3_symphony.common.noise`; ``None`` counts as 0
+    :param action_noise: SB3's, of which it is ``sigma``, or one of :mod:`sb3_symphony.common.noise`; ``None`` counts as 0
     """
     if action_noise is None:
         return 0.0
     if isinstance(action_noise, VectorizedActionNoise):
         return float(np.mean([noise_std(noise) for noise in action_noise.noises]))
-    return float(np.mean(getattr(action_noise, "sigma_t", getattr(action_noise, "_sigma", np.nan))))
+    return float(np.mean(getattr(action_noise, "std", getattr(action_noise, "_sigma", np.nan))))

@@ -226,15 +226,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
                     next_q_values = self._regression.target_q_values(batch.next_observations, next_action, self._draw_subset())
                     next_values = combine(next_q_values, self.target_mode) + entropy.reshape(-1, 1)
                     target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
-
-                weights = getattr(batch, "weights", None)
-                loss, q_values = self._regression.fit(batch.observations, batch.actions, target, self.tau, weights)
-                self._update_priorities(batch, target, q_values)
-                self._n_updates += 1
-
-                logs["critic_loss"].append(loss)
-                logs["q_values"].append(q_values)
-                logs["target_q_mean"].append(target)
+                self._fit_critics(batch, target, logs)
 
             if self._n_updates % self.policy_delay == 0:
                 self._update_actor(batches[-1], ent_coef, logs)

@@ -246,14 +246,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
                 # The author moves the target critics before he computes the target; moving them right after the
                 # critics' step, as here, gives the same numbers
-                weights = getattr(batch, "weights", None)
-                loss, q_values = self._regression.fit(batch.observations, batch.actions, target, self.tau, weights)
-                self._update_priorities(batch, target, q_values)
-                self._n_updates += 1
-
-                logs["critic_loss"].append(loss)
-                logs["q_values"].append(q_values)
-                logs["target_q_mean"].append(target)
+                self._fit_critics(batch, target, logs)
 
             if self._n_updates % self.policy_delay == 0:
                 self._update_actor(batches[-1], logs)
@@ -279,8 +272,10 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         if self.warmup_policy == "actor" and self.num_timesteps < learning_starts:
-            if self._redraw_actor and self._n_updates == 0:  # never a trained one, when learn() starts counting anew
+            # Never a trained one, when learn() starts counting anew or its weights are another model's
+            if self._redraw_actor and self._n_updates == 0 and not self.actor.optimizer.state:
                 self.actor.redraw()
+                self.policy.restart_average()
                 self._redraw_actor = False
             learning_starts = 0  # the actor acts, with noise
         return super()._sample_action(learning_starts, action_noise, n_envs)
