@@ -3,13 +3,17 @@
 import math
 import re
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import SAC, TD3
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_symphony import REDQ, DroQ, Symphony
 from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
+from sb3_symphony.common.noise import DecayingNormalActionNoise, StickyActionNoise
 
 
 def refused(build, name, value, *errors):
@@ -317,9 +321,30 @@ def test_edges_are_allowed(make):
     make(tau=1.0, gamma=0.0, gradient_steps=-1, buffer_size=1, batch_size=1).learn(30)
 
 
-def test_noise_of_a_wrong_size(make):
-    with pytest.raises(ValueError):
-        make(action_noise=NormalActionNoise(np.zeros(3), np.ones(3))).learn(30)
+@pytest.mark.parametrize("noise", [NormalActionNoise(np.zeros(3), np.ones(3)), StickyActionNoise(3)], ids=str)
+def test_noise_of_a_wrong_size(make, noise):
+    with pytest.raises(ValueError, match=r"action_noise=.*: its shape is \(3,\), expected \(1,\), that of an action"):
+        make(action_noise=noise)
+
+
+def test_one_number_for_several_actions():
+    """An own noise has one for each; SB3's may have one mean for all."""
+    env = gym.make("BipedalWalker-v3")
+    with pytest.raises(ValueError, match=r"its shape is \(1,\), expected \(4,\)"):
+        Symphony("MlpPolicy", env, action_noise=DecayingNormalActionNoise(1), buffer_size=10)
+    Symphony("MlpPolicy", env, action_noise=NormalActionNoise(np.zeros(1), np.ones(1)), buffer_size=10)
+
+
+@pytest.mark.parametrize("value", [dict(pi=False, qf=False), "yes", [True, "no"], None], ids=str)
+def test_layer_norm_of_redq(small, value):
+    with pytest.raises(ValueError, match=r"layer_norm=.*: expected one of True, False"):
+        small(REDQ, policy_kwargs=dict(layer_norm=value))
+
+
+@pytest.mark.parametrize("policy", [TD3.policy_aliases["MlpPolicy"], SAC.policy_aliases["MlpPolicy"]])
+def test_policies_of_sb3(algorithm, policy):
+    with pytest.raises(ValueError, match=rf"policy={policy.__name__}: expected (Symphony|REDQ)Policy or a class derived"):
+        algorithm(policy, "Pendulum-v1", buffer_size=10)
 
 
 LOADED_WRONGLY = [
@@ -349,6 +374,54 @@ def test_own_arguments_of_load(small, tmp_path):
     small(Symphony).save(tmp_path / "symphony")
     with pytest.raises(ValueError, match="did you mean 'rehae'"):
         Symphony.load(tmp_path / "symphony", actor_loss="rehaee")
+
+
+def test_models_of_another_algorithm(small, tmp_path):
+    small(REDQ).save(tmp_path / "redq")
+    small(Symphony).save(tmp_path / "symphony")
+    with pytest.raises(ValueError, match="policy=REDQPolicy: expected SymphonyPolicy"):
+        Symphony.load(tmp_path / "redq")
+    with pytest.raises(ValueError, match="policy=SymphonyPolicy: expected REDQPolicy"):
+        REDQ.load(tmp_path / "symphony")
+
+
+def test_unknown_arguments_of_load(make, algorithm, tmp_path):
+    make().save(tmp_path / "model")
+    with pytest.raises(TypeError, match=r"load\(\) got an unexpected argument 'gama': did you mean 'gamma'\?"):
+        algorithm.load(tmp_path / "model", gama=0.5)
+    assert algorithm.load(tmp_path / "model", gamma=0.5, verbose=0).gamma == 0.5
+
+
+def test_entropy_coefficients_of_load(small, tmp_path):
+    small(REDQ, ent_coef=0.1).save(tmp_path / "fixed")
+    assert REDQ.load(tmp_path / "fixed")._current_ent_coef().item() == pytest.approx(0.1)
+    assert REDQ.load(tmp_path / "fixed", ent_coef=0.5)._current_ent_coef().item() == 0.5
+    with pytest.raises(ValueError, match="ent_coef='auto': the saved model has a fixed one"):
+        REDQ.load(tmp_path / "fixed", ent_coef="auto")
+    small(REDQ).save(tmp_path / "learned")
+    with pytest.raises(ValueError, match=r"ent_coef=0\.1: the saved model has a learned one"):
+        REDQ.load(tmp_path / "learned", ent_coef=0.1)
+
+
+def test_a_replay_buffer_takes_the_horizon_of_the_model(make, algorithm, tmp_path):
+    model = make(n_steps=3, gamma=0.9).learn(60)
+    model.save(tmp_path / "model")
+    model.save_replay_buffer(tmp_path / "buffer")
+    loaded = algorithm.load(tmp_path / "model", env=model.get_env(), n_steps=2, gamma=0.5)
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    discounts = loaded.replay_buffer.sample(200).discounts
+    assert {0.25} <= set(discounts.flatten().tolist()) <= {0.25, 0.5}  # the last step of an episode has one reward
+    assert model.replay_buffer.sample(200).discounts.min().item() == pytest.approx(0.9**3)
+
+
+def test_a_replay_buffer_without_horizon(small, tmp_path):
+    plain = small(REDQ, replay_buffer_class=ReplayBuffer).learn(30)
+    plain.save_replay_buffer(tmp_path / "buffer")
+    model = small(REDQ, n_steps=3)
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match="n_steps=3: the saved ReplayBuffer has no n-step returns"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is own
 
 
 def test_a_noise_is_an_object(small):

@@ -1,9 +1,10 @@
 """What Symphony and REDQ share: everything that SB3 expects of an off-policy algorithm with an ensemble of critics."""
 
 import inspect
+import math
 import warnings
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -11,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -22,12 +24,13 @@ from sb3_symphony.common.buffers import (
     check_mirror,
     end_trajectory,
 )
-from sb3_symphony.common.checks import check_choice, check_number
+from sb3_symphony.common.checks import check_choice, check_number, suggestion
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CLASSIFICATION, CRITIC_LOSSES
 from sb3_symphony.common.noise import DecayingActionNoise
 from sb3_symphony.common.regression import make_regression
 
+SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
@@ -73,6 +76,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
     """
 
     policy: Any  # SymphonyPolicy or REDQPolicy
+    base_policy: ClassVar[type[BasePolicy]]  # what a policy class has to be derived from
     actor: Any  # of that policy
     critic: EnsembleCritic
     critic_target: EnsembleCritic
@@ -116,6 +120,10 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _check_arguments(self) -> None:
         """Of a new model, and of a loaded one, whose arguments may have been replaced."""
+        if not issubclass(self.policy_class, self.base_policy):
+            raise ValueError(
+                f"policy={self.policy_class.__name__}: expected {self.base_policy.__name__} or a class derived from it"
+            )
         if not callable(self.learning_rate):
             check_number("learning_rate", self.learning_rate, 0)
         check_number("buffer_size", self.buffer_size, 1, integer=True)
@@ -140,8 +148,20 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             raise ValueError(f"n_critics={self.n_critics!r}: the saved model has {self.policy_kwargs['n_critics']!r}")
         if self.action_noise is not None and not isinstance(self.action_noise, ActionNoise):
             raise TypeError(f"action_noise={self.action_noise!r}: expected an ActionNoise or None")
+        self._check_noise_shape()
         if self.optimize_memory_usage and self.n_steps > 1:
             raise ValueError("optimize_memory_usage=True: n-step returns need n_steps=1 then")
+
+    def _check_noise_shape(self) -> None:
+        noise = self.action_noise.noises[0] if isinstance(self.action_noise, VectorizedActionNoise) else self.action_noise
+        given, wanted = np.shape(getattr(noise, "_mu", 0.0)), self.action_space.shape
+        assert wanted is not None  # of a Box
+        if isinstance(noise, DecayingActionNoise):
+            given, fits = noise.shape, noise.shape == wanted
+        else:  # SB3's takes one mean for all actions, too
+            fits = given == wanted[len(wanted) - len(given) :] or math.prod(given) == 1
+        if not fits:
+            raise ValueError(f"action_noise={noise}: its shape is {given}, expected {wanted}, that of an action")
 
     def _check_classification(self) -> None:
         value_range = self.policy_kwargs.get("value_range")
@@ -164,6 +184,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             for_dict, for_n_steps, otherwise = self.default_buffers
             is_dict = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = chosen = for_dict if is_dict else for_n_steps if n_steps > 1 else otherwise
+        if isinstance(self.observation_space, spaces.Dict) and not issubclass(chosen, DictReplayBuffer):
+            raise ValueError(f"replay_buffer_class={chosen.__name__}: expected one for Dict observations")
         if "fade_factor" in given and not issubclass(chosen, FADING_BUFFERS):
             raise ValueError(f"fade_factor={given['fade_factor']!r}: {chosen.__name__} does not fade")
         if issubclass(chosen, NStepReplayBuffer):
@@ -315,6 +337,43 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self._logged_updates = self._logged_transitions = 0
 
     # ---------------------------------------------------------------- saving
+
+    @classmethod
+    def load(cls: type[SelfEnsemble], *args: Any, **kwargs: Any) -> SelfEnsemble:
+        """
+        SB3's, which takes any keyword for an attribute: here it has to be an argument of ``load`` or of the constructor.
+
+        :param args: those of SB3's ``load``
+        :param kwargs: those of SB3's ``load``, and arguments of the constructor that replace the saved ones
+        :return: the model
+        :raises TypeError: for an unknown argument
+        :raises ValueError: if an argument is out of range or does not fit the saved model
+        """
+        known = set(inspect.signature(super().load).parameters)
+        known.update(name for base in cls.__mro__ for name in inspect.signature(base).parameters)
+        for name in kwargs:
+            if name not in known:
+                raise TypeError(f"load() got an unexpected argument {name!r}{suggestion(name, known)}")
+        return super().load(*args, **kwargs)
+
+    def load_replay_buffer(self, *args: Any, **kwargs: Any) -> None:
+        """
+        SB3's; the horizon of its returns and their discount become the model's.
+
+        :param args: those of SB3's ``load_replay_buffer``
+        :param kwargs: likewise
+        :raises ValueError: if the model needs n-step returns and the buffer has none; the model's own buffer then stays
+        """
+        before = self.replay_buffer
+        super().load_replay_buffer(*args, **kwargs)
+        loaded = self.replay_buffer
+        if isinstance(loaded, NStepReplayBuffer):
+            loaded.n_steps, loaded.gamma = self.n_steps, self.gamma
+        elif self.n_steps > 1:
+            self.replay_buffer = before
+            raise ValueError(
+                f"n_steps={self.n_steps}: the saved {type(loaded).__name__} has no n-step returns, expected n_steps=1"
+            )
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression"]

@@ -74,6 +74,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
     :raises TypeError: if an argument has the wrong type
     """
 
+    base_policy = REDQPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
@@ -153,6 +154,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
         self.log_ent_coef: th.Tensor | None = None
+        self._learns_ent_coef: bool | None = None  # in a saved model
         self.ent_coef_optimizer: th.optim.Adam | None = None
 
         if _init_setup_model:
@@ -180,6 +182,10 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         if initial is None:
             raise ValueError(f"ent_coef={self.ent_coef!r}: expected a number, 'auto' or 'auto_<initial value>'")
         check_number("ent_coef", initial, 0, exclusive=learned)
+        if self._learns_ent_coef not in (None, learned):
+            saved = "a fixed one" if learned else "a learned one"
+            raise ValueError(f"ent_coef={self.ent_coef!r}: the saved model has {saved}")
+        self._learns_ent_coef = learned
         if learned:
             # The log is optimised, as in SB3
             self.log_ent_coef = th.full((1,), np.log(initial), device=self.device, dtype=th.float32).requires_grad_()
@@ -287,8 +293,8 @@ class REDQ(EnsembleOffPolicyAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
-        if self.ent_coef_optimizer is None:
-            return state_dicts, [*tensors, "ent_coef_tensor"]
+        if self.ent_coef_optimizer is None:  # fixed: it is an argument, which may be replaced when loading
+            return state_dicts, tensors
         return [*state_dicts, "ent_coef_optimizer"], [*tensors, "log_ent_coef"]
 
 

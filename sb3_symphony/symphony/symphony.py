@@ -85,6 +85,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :raises TypeError: if an argument has the wrong type
     """
 
+    base_policy = SymphonyPolicy
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
