@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -289,6 +290,108 @@ def test_own_robot(folder, monkeypatch, capsys):
     assert main(f"evaluate --algo sac {argv} -n 2".split()) == 0
     assert main("train --algo sac --env Xyzzy-v0".split()) == 2
     assert "--gym-packages" in capsys.readouterr().err
+
+
+KINDS_ENV = """
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+OBSERVATIONS = {
+    "vector": spaces.Box(-1, 1, (3,)),
+    "image": spaces.Box(0, 255, (36, 36, 3), np.uint8),
+    "dict": spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Box(-1, 1, (1,))}),
+    "tuple": spaces.Tuple((spaces.Box(-1, 1, (2,)),)),
+    "nested": spaces.Dict({"a": spaces.Dict({"b": spaces.Box(-1, 1, (2,))})}),
+    "goal": spaces.Dict({name: spaces.Box(-1, 1, (2,)) for name in ("observation", "achieved_goal", "desired_goal")}),
+}
+
+
+class Kinds(gym.Env):
+    def __init__(self, observations="vector", actions=(2,)):
+        self.observation_space = OBSERVATIONS[observations]
+        self.action_space = spaces.Box(-1, 1, tuple(actions))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self.t += 1
+        done = self.t % 10 == 0
+        return self.observation_space.sample(), 0.0, False, done, {"is_success": bool(action.sum() > 0)} if done else {}
+
+    def compute_reward(self, achieved, desired, info):
+        return np.zeros(len(achieved))
+
+
+if "Kinds-v0" not in gym.registry:
+    gym.register("Kinds-v0", entry_point=Kinds)
+"""
+
+
+@pytest.fixture
+def kinds(folder, monkeypatch):
+    """The start of a command line for environments of many kinds."""
+    (folder / "kinds.py").write_text(KINDS_ENV)
+    monkeypatch.syspath_prepend(str(folder))
+    return (
+        "train --env Kinds-v0 --gym-packages kinds -n 60 --quiet --seed 1 -params learning_starts:30 buffer_size:100".split()
+    )
+
+
+def test_images_with_evaluations(kinds):
+    argv = [*kinds, "policy:CnnPolicy", "--env-kwargs", "observations:image", "--eval-freq", "30", "--eval-episodes", "1"]
+    assert main([*argv, "--algo", "redq"]) == 0
+    found = "--algo redq --env Kinds-v0 --gym-packages kinds -n 1".split()
+    assert main(["evaluate", *found]) == 0
+
+
+@pytest.mark.parametrize("noise", ["noise_type:normal noise_std:0.1", "action_noise:PinkActionNoise"])
+@pytest.mark.parametrize("actions", ["[2,2]", "[2]", "[]"])
+def test_actions_of_any_shape_with_noise(kinds, noise, actions):
+    argv = [*kinds, *noise.split(), "--env-kwargs", f"actions:{actions}", "--eval-freq", "0"]
+    assert main([*argv, "--algo", "symphony"]) == 0
+
+
+@pytest.mark.parametrize("algo", ["sac", "redq"])
+def test_agent_of_a_run_that_saved_memory(kinds, algo):
+    memory = ["optimize_memory_usage:true", "replay_buffer_kwargs:{handle_timeout_termination: false}"]
+    memory += ["replay_buffer_class:ReplayBuffer"] * (algo == "redq")
+    assert main([*kinds, *memory, "--algo", algo, "--eval-freq", "0"]) == 0
+    assert main(f"evaluate --algo {algo} --env Kinds-v0 --gym-packages kinds -n 1".split()) == 0
+
+
+def test_successes_in_the_monitor_files(kinds, folder, capsys):
+    assert main([*kinds, "--algo", "sac", "--eval-freq", "0"]) == 0
+    (path,) = (folder / "logs" / "sac").glob("*/0.monitor.csv")
+    _, header, *rows = path.read_text().splitlines()
+    assert header == "r,l,t,is_success" and len(rows) == 6
+    assert {row.rpartition(",")[2] for row in rows} <= {"True", "False"}
+    assert main("plot -y success --algo sac".split()) == 0
+
+
+HER = ["policy:MultiInputPolicy", "replay_buffer_class:HerReplayBuffer"]
+
+
+@pytest.mark.parametrize(
+    ("observations", "arguments", "message"),
+    [
+        ("goal", [*HER, "replay_buffer_kwargs:{goal_selection_strategy: futur}"], "futur"),
+        ("dict", HER, "HerReplayBuffer"),
+        ("dict", ["policy:MultiInputPolicy", "replay_buffer_class:ReplayBuffer"], "ReplayBuffer"),
+        ("tuple", [], "Tuple"),
+        ("nested", ["policy:MultiInputPolicy"], "[Nn]ested"),
+        ("vector", ["policy_kwargs.features_extractor_class:CombinedExtractor"], "spaces"),
+        ("vector", ["env_wrapper:stable_baselines3.common.atari_wrappers.NoopResetEnv"], "NoopResetEnv"),
+    ],
+)
+def test_what_does_not_fit_the_observations(kinds, folder, capsys, observations, arguments, message):
+    argv = [*kinds, *arguments, "--env-kwargs", f"observations:{observations}", "--algo", "redq", "--eval-freq", "0"]
+    assert main(argv) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert re.search(message, line) and not (folder / "logs").exists()
 
 
 def test_arguments_of_the_evaluation():

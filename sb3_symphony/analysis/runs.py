@@ -112,7 +112,7 @@ def _monitor_rows(rows: csv.DictReader, start: float) -> Iterator[tuple[float, f
     for row in rows:
         try:
             seconds, result = float(row["t"]), (float(row["r"]), int(row["l"]))
-            success = {"True": 1.0, "False": 0.0, None: np.nan}[row.get("is_success")]
+            success = {"True": 1.0, "False": 0.0, "": np.nan, None: np.nan}[row.get("is_success")]
         except (TypeError, ValueError, KeyError):
             continue
         if seconds < before:  # a resumed run counts from zero again

@@ -229,7 +229,7 @@ class ExactCheckpoints(BaseCallback):
 
     def __init__(
         self,
-        folder: Path,
+        folder: str | Path,
         save_freq: int,
         keep: int = 2,
         callbacks: Sequence[BaseCallback] = (),
@@ -242,7 +242,7 @@ class ExactCheckpoints(BaseCallback):
         super().__init__()
         check_number("save_freq", save_freq, 1, integer=True)
         check_number("keep", keep, 1, integer=True)
-        self.folder = folder
+        self.folder = Path(folder)
         self.save_freq = save_freq
         self.keep = keep
         self.callbacks = callbacks
@@ -255,7 +255,7 @@ class ExactCheckpoints(BaseCallback):
         self._latest = 0 if checkpoint is None else checkpoint.steps
         # Of another agent, which the run began with
         self._rows_before = 0 if checkpoint is None else checkpoint.state.get("rows before", 0)
-        self.segments = ReplaySegments(folder, [] if checkpoint is None else checkpoint.state["segments"])
+        self.segments = ReplaySegments(self.folder, [] if checkpoint is None else checkpoint.state["segments"])
         self._segments_of: dict[int, set[str]] = {}  # steps of a checkpoint -> files that it needs
         self._restoring = checkpoint
 

@@ -202,6 +202,7 @@ def _substitutes() -> dict[str, Any]:
     Python, NumPy or Stable-Baselines3, and make a replay buffer of full size. Made anew each time, as SB3 changes them.
     """
     substitutes: dict[str, Any] = {"learning_rate": 0.0, "replay_buffer_kwargs": {}, "verbose": 0}
+    substitutes["optimize_memory_usage"] = False
     substitutes.update(dict.fromkeys(("lr_schedule", "clip_range", "exploration_schedule"), lambda _: 0.0))
     substitutes.update(dict.fromkeys(("ep_info_buffer", "ep_success_buffer", "_last_obs", "_last_original_obs")))
     substitutes.update(dict.fromkeys(("_last_episode_starts", "_last_lstm_states", "clip_range_vf", "tensorboard_log")))

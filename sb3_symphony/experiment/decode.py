@@ -276,7 +276,7 @@ def _named_classes(key: str, value: Any) -> Any:
     return class_by_name(key, value)
 
 
-def _action_noise(value: Any, n_actions: int, n_envs: int) -> Any:
+def _action_noise(value: Any, n_actions: int | tuple[int, ...], n_envs: int) -> Any:
     """``{StickyActionNoise: {sigma: 0.3}}`` → that noise for this action space."""
     name, arguments = next(iter(value.items())) if isinstance(value, dict) and len(value) == 1 else (value, {})
     arguments = {} if arguments is None else arguments
@@ -295,7 +295,7 @@ def _action_noise(value: Any, n_actions: int, n_envs: int) -> Any:
     arguments |= {key: filled[key] for key in filled if key in types}
     try:
         if "n_actions" not in types:
-            arguments |= {key: np.full(n_actions, arguments[key]) for key in ("mean", "sigma") if key in arguments}
+            arguments |= {key: np.full(n_actions or 1, arguments[key]) for key in ("mean", "sigma") if key in arguments}
         return class_(**arguments)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"action_noise: {name}: {error}") from None
@@ -368,7 +368,9 @@ def algorithm_arguments(
         near = near or f" — expected one of {', '.join(algorithm.policy_aliases)}"
         raise ConfigError(f"policy: unknown policy '{settings.policy}' for {name}{near}")
 
-    n_actions = int(np.prod(action_space.shape or (1,)))
+    shape = action_space.shape
+    assert shape is not None  # of a Box or a discrete space
+    n_actions = shape[0] if len(shape) == 1 else shape
     plain_arguments = dict(config.arguments)
     if settings.noise_type is not None:
         if "action_noise" not in known or "action_noise" in plain_arguments:

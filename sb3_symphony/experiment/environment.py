@@ -8,11 +8,12 @@ from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
@@ -27,7 +28,7 @@ from stable_baselines3.common.vec_env import (
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.recording import RecordedEpisode
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
-from sb3_symphony.experiment.config import ConfigError, RunSettings
+from sb3_symphony.experiment.config import ConfigError, RunSettings, reason
 from sb3_symphony.experiment.decode import typed_arguments
 
 #: evaluation episode i runs on environment seed 10 000 + i
@@ -128,9 +129,9 @@ def _wrapped(env: gym.Env, wrappers: Wrappers) -> gym.Env:
     for wrapper in wrappers:
         try:
             env = wrapper(env)
-        except (ValueError, TypeError, AssertionError) as error:
+        except Exception as error:  # such as AttributeError, of a wrapper for another kind of environment
             named = getattr(wrapper, "func", wrapper)  # a class with arguments, or any function
-            raise ConfigError(f"env_wrapper: {named.__name__}: {error}") from None
+            raise ConfigError(f"env_wrapper: {named.__name__}: {reason(error)}") from error
     return env
 
 
@@ -267,8 +268,52 @@ def stacked(env: VecEnv, settings: RunSettings) -> VecEnv:
         raise ConfigError(f"frame_stack: observations of {env.observation_space} cannot be stacked — {error}") from None
 
 
+class _EpisodeWriter(ResultsWriter):
+    """
+    The file of a :class:`RunMonitor`. A row that the ``Monitor`` writes is kept until :meth:`complete`.
+
+    :param path: the file
+    :param header: what its first line tells
+    :param append: go on with it if it is there
+    """
+
+    def __init__(self, path: Path, header: dict[str, float | str], append: bool) -> None:
+        lines = path.read_text().splitlines() if append and path.exists() else []
+        self.path, self.header = path, header
+        self.n_rows = max(0, len(lines) - 2)
+        self.row: dict[str, Any] | None = None
+        self._open(tuple(lines[1].split(",")[3:]) if len(lines) > 1 else (), append)
+
+    def _open(self, columns: tuple[str, ...], append: bool) -> None:
+        self.columns = columns  # beside return, length and time
+        super().__init__(str(self.path), self.header, columns, override_existing=not append)
+
+    def write_row(self, epinfo: dict[str, Any]) -> None:
+        self.row = dict(epinfo)
+
+    def complete(self, info: dict[str, Any]) -> None:
+        """
+        Write the row of the episode that has just ended, if one has.
+
+        :param info: what the environment told at its end
+        """
+        if self.row is None:
+            return
+        if self.n_rows == 0 and "is_success" in info:
+            self.close()
+            self._open(("is_success",), append=False)
+        told = {column: bool(info[column]) for column in self.columns if column in info}
+        super().write_row({**self.row, **told})
+        self.row = None
+        self.n_rows += 1
+
+
 class RunMonitor(Monitor):
-    """A ``Monitor`` whose file may come later, in whichever process it is."""
+    """
+    A ``Monitor`` whose file may come later, in whichever process it is.
+
+    If the environment tells at the end of the first episode whether it was a success, the file has a column for that.
+    """
 
     def write_to(self, path: str, append: bool) -> None:
         """
@@ -277,7 +322,13 @@ class RunMonitor(Monitor):
         """
         self.t_start = time.time()
         header: dict[str, float | str] = {"t_start": self.t_start, "env_id": str(self.spec.id if self.spec else None)}
-        self.results_writer = ResultsWriter(path, header=header, override_existing=not append)
+        self.results_writer = _EpisodeWriter(Path(f"{path}.{self.EXT}"), header, append)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = super().step(action)
+        if isinstance(self.results_writer, _EpisodeWriter):
+            self.results_writer.complete(info)
+        return observation, reward, terminated, truncated, info
 
 
 def _in_own_process(make: Callable[[], gym.Env], packages: list[str]) -> gym.Env:
@@ -318,7 +369,10 @@ def make_training_env(
         one(0).close()  # a mistake is told here
         env = SubprocVecEnv([partial(_in_own_process, make, packages or []) for make in makers])
     else:
-        env = DummyVecEnv(makers)
+        try:
+            env = DummyVecEnv(makers)
+        except NotImplementedError as error:  # a kind of observations
+            raise ConfigError(f"{env_id}: {error}") from None
     env.seed(seed)
     try:
         return stacked(_normalized(vec_wrapped(env, settings), settings, gamma, training=True), settings)
@@ -340,7 +394,8 @@ def make_evaluation_env(env_id: str, settings: RunSettings, env_kwargs: dict[str
         return Monitor(EpisodeSeeds(make_env(env_id, {**settings.env_kwargs, **(env_kwargs or {})}, task)))
 
     env = vec_wrapped(DummyVecEnv([evaluation_env]), settings)
-    return stacked(_normalized(env, settings, None, training=False), settings)
+    env = stacked(_normalized(env, settings, None, training=False), settings)
+    return BaseAlgorithm._wrap_env(env, verbose=0, monitor_wrapper=False)  # images with their channels first, as in training
 
 
 def attach_monitor_files(env: VecEnv, folder: Path, append: bool = False) -> None:

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import torch as th
 from filelock import FileLock, Timeout
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.analysis.plots import plot_training
 from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of
@@ -27,7 +29,7 @@ from sb3_symphony.experiment.callbacks import (
     configured_callbacks,
     save_model,
 )
-from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, check_algorithm, load_config
+from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, check_algorithm, load_config, reason
 from sb3_symphony.experiment.decode import algorithm_arguments
 from sb3_symphony.experiment.environment import (
     attach_monitor_files,
@@ -125,14 +127,23 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
     try:
         check_spaces(env, options.env, options.algo, config.settings.policy)
         arguments = algorithm_arguments(options.algo, algorithm, config, env.action_space)
+        _check_goals(env, options.env, arguments.get("replay_buffer_class"))
         if options.tensorboard_log:
             arguments["tensorboard_log"] = str(Path(options.tensorboard_log) / options.env.replace("/", "-"))
         return algorithm(env=env, seed=seed, device=options.device, verbose=verbose, **arguments)
-    except (ValueError, TypeError, AssertionError, MemoryError) as error:
+    except Exception as error:  # SB3, or a class that the configuration names, can refuse a value in any way
         env.close()
         if isinstance(error, ConfigError):
             raise
-        raise ConfigError(f"{options.algo} on {options.env}: {error}") from error
+        raise ConfigError(f"{options.algo} on {options.env}: {reason(error)}") from error
+
+
+def _check_goals(env: VecEnv, env_id: str, replay_buffer_class: type | None) -> None:
+    if replay_buffer_class is None or not issubclass(replay_buffer_class, HerReplayBuffer):
+        return
+    space = env.observation_space
+    if not (isinstance(space, spaces.Dict) and {"achieved_goal", "desired_goal"} <= space.keys()):
+        raise ConfigError(f"replay_buffer_class: 'HerReplayBuffer' — needs observations with goals, {env_id} has {space}")
 
 
 def _evaluation(

@@ -73,6 +73,7 @@ def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: b
         raise ConfigError(f"-i: {error}") from None
     check_match(trained, env, selection)
     _take_networks(model, trained, selection)
+    assert model.seed is not None
     set_random_seed(model.seed)  # loading has left the trained one's
     if normalization is not None and selection.normalization is not None:
         stored = load_normalization(selection.normalization, normalization.venv)
@@ -103,7 +104,7 @@ def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, selection: Sele
         ) from None
     if isinstance(model.policy, AveragedActor):
         model.policy.restart_average()  # its count of updates came along
-    known = set(trained._get_torch_save_params()[1]) - {"ent_coef_tensor"}  # which the configuration fixes
+    known = set(trained._get_torch_save_params()[1]) - {"ent_coef_tensor"}  # SAC's, which the configuration fixes
     for name in known & set(tensors):
         recursive_getattr(model, name).data.copy_(recursive_getattr(trained, name))
 
