@@ -12,19 +12,10 @@ from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.env_util import unwrap_wrapper
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_symphony.common.checks import check_choice, check_number, check_pair
-
-
-def _find_wrapper(env: gym.Env, wrapper_class: type[gym.Wrapper]) -> Any:
-    """The outermost wrapper of that class around ``env``, or None."""
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, wrapper_class):
-            return env
-        env = env.env
-    return None
-
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Repeatable Box2D episodes
@@ -49,7 +40,7 @@ def needs_fresh_world(env: gym.Env) -> bool:
     :param env: any environment
     :return: True for an environment with a Box2D world (BipedalWalker, LunarLander, CarRacing) not yet wrapped
     """
-    return _has_box2d_world(env) and _find_wrapper(env, FreshBox2DWorld) is None
+    return _has_box2d_world(env) and unwrap_wrapper(env, FreshBox2DWorld) is None
 
 
 class FreshBox2DWorld(gym.Wrapper):
@@ -101,9 +92,9 @@ class LearningReward(gym.Wrapper):
     """
 
     def __init__(self, env: gym.Env) -> None:
-        if _find_wrapper(env, Monitor) is None:
+        if unwrap_wrapper(env, Monitor) is None:
             env = Monitor(env)
-        self._innermost = _find_wrapper(env, LearningReward) is None
+        self._innermost = unwrap_wrapper(env, LearningReward) is None
         super().__init__(env)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -348,7 +339,7 @@ class EpisodeStepLimit(gym.Wrapper):
         self._total_steps = 0
         self._episode_steps = 0
         self._inner: EpisodeStepLimit | None = None
-        monitor = _find_wrapper(env, Monitor)
+        monitor = unwrap_wrapper(env, Monitor)
         if monitor is not None:
             self._inner = monitor.env = EpisodeStepLimit(monitor.env, max_steps, until_total_steps)
 
