@@ -1,7 +1,9 @@
 """What Symphony and REDQ share: everything that SB3 expects of an off-policy algorithm with an ensemble of critics."""
 
 import inspect
+import io
 import math
+import pathlib
 import warnings
 from collections.abc import Iterator
 from typing import Any, ClassVar, TypeVar
@@ -14,7 +16,7 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.type_aliases import ReplayBufferSamples, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, TrainFreq
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import (
@@ -339,33 +341,37 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
     # ---------------------------------------------------------------- saving
 
     @classmethod
-    def load(cls: type[SelfEnsemble], *args: Any, **kwargs: Any) -> SelfEnsemble:
+    def load(
+        cls: type[SelfEnsemble],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfEnsemble:
         """
-        SB3's, which takes any keyword for an attribute: here it has to be an argument of ``load`` or of the constructor.
+        SB3's, except that it does not take any keyword for an attribute.
 
-        :param args: those of SB3's ``load``
-        :param kwargs: those of SB3's ``load``, and arguments of the constructor that replace the saved ones
-        :return: the model
-        :raises TypeError: for an unknown argument
+        :param kwargs: Arguments of the constructor, in place of the saved ones
+        :raises TypeError: for another keyword
         :raises ValueError: if an argument is out of range or does not fit the saved model
         """
-        known = set(inspect.signature(super().load).parameters)
-        known.update(name for base in cls.__mro__ for name in inspect.signature(base).parameters)
+        known = {name for base in cls.__mro__ for name in inspect.signature(base).parameters}
         for name in kwargs:
             if name not in known:
                 raise TypeError(f"load() got an unexpected argument {name!r}{suggestion(name, known)}")
-        return super().load(*args, **kwargs)
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
-    def load_replay_buffer(self, *args: Any, **kwargs: Any) -> None:
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        SB3's; the horizon of its returns and their discount become the model's.
+        SB3's; the horizon of the buffer's returns and their discount become the model's.
 
-        :param args: those of SB3's ``load_replay_buffer``
-        :param kwargs: likewise
         :raises ValueError: if the model needs n-step returns and the buffer has none; the model's own buffer then stays
         """
         before = self.replay_buffer
-        super().load_replay_buffer(*args, **kwargs)
+        super().load_replay_buffer(path, truncate_last_traj)
         loaded = self.replay_buffer
         if isinstance(loaded, NStepReplayBuffer):
             loaded.n_steps, loaded.gamma = self.n_steps, self.gamma
