@@ -461,8 +461,8 @@ def test_action_noises(make, noise, n_envs):
     model.learn(60)
     assert_finite(model)
     assert isinstance(model.action_noise, VectorizedActionNoise) == (n_envs > 1)
-    # A disturbance has no standard deviation of its own, but an amplitude
-    assert np.isfinite(model.logger.name_to_value["train/noise_std"])
+    # That of a disturbance is not known
+    assert np.isnan(model.logger.name_to_value["train/noise_std"]) == isinstance(noise, DisturbanceActionNoise)
 
 
 def test_vectorised_noise_may_be_given(make):
