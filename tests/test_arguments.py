@@ -341,6 +341,12 @@ def test_layer_norm_of_redq(small, value):
         small(REDQ, policy_kwargs=dict(layer_norm=value))
 
 
+@pytest.mark.parametrize("value", ["yes", dict(pi=True, qf="no"), [True, None]], ids=str)
+def test_layer_norm_of_symphony(small, value):
+    with pytest.raises(ValueError, match=r"layer_norm=.*: expected one of True, False"):
+        small(Symphony, policy_kwargs=dict(layer_norm=value))
+
+
 @pytest.mark.parametrize("policy", [TD3.policy_aliases["MlpPolicy"], SAC.policy_aliases["MlpPolicy"]])
 def test_policies_of_sb3(algorithm, policy):
     with pytest.raises(ValueError, match=rf"policy={policy.__name__}: expected (Symphony|REDQ)Policy or a class derived"):

@@ -11,7 +11,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_symphony.common.checks import check_number
+from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear
 from sb3_symphony.common.losses import ValueBins
 
@@ -51,6 +51,9 @@ def hidden_layers(
     for name, values in (("activation_fn", activation_fn), ("layer_norm", layer_norm)):
         if isinstance(values, Sequence) and not values:
             raise ValueError(f"{name}={values!r}: expected at least one entry")
+
+    for each in layer_norm if isinstance(layer_norm, Sequence) and not isinstance(layer_norm, str) else [layer_norm]:
+        check_choice("layer_norm", each, (True, False))
 
     def at(values: T | Sequence[T], i: int) -> T:
         return values[min(i, len(values) - 1)] if isinstance(values, Sequence) else values

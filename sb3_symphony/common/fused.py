@@ -7,7 +7,7 @@ networks of this size that costs more than the matrix products. Here torch makes
 """
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -79,6 +79,12 @@ def array(tensor: th.Tensor) -> np.ndarray:
     return tensor.detach().numpy()
 
 
+@cache
+def all_members(n: int) -> np.ndarray:
+    """Indices ``(n,)`` of all networks in their order: always the same array, so that asking for it costs no comparison."""
+    return np.arange(n)
+
+
 class Products:
     """
     The products of a hidden layer: with its weights, and the two of its backward pass.
@@ -88,7 +94,6 @@ class Products:
 
     def __init__(self, weight: th.Tensor) -> None:
         self.weight = weight
-        self.all_members = np.arange(len(weight))
 
     def forward(self, x: th.Tensor, members: np.ndarray, out: th.Tensor) -> None:
         """
@@ -96,7 +101,7 @@ class Products:
         :param members: Indices ``(n,)`` of the networks to compute
         :param out: Where to write the result ``(n, batch, width)``
         """
-        if np.array_equal(members, self.all_members):  # all, and in this order
+        if members is all_members(len(self.weight)):
             th.bmm(x, self.weight, out=out)
         else:  # one by one, rather than gather the weights first
             for k, each, result in zip(members.tolist(), x, out, strict=True):
@@ -141,7 +146,7 @@ class BFloat16Products(Products):
         n = len(members)
         rounded_x, weight, product = self.operands[0][:n], self.operands[1][:n], self.results[2][:n]
         rounded_x.copy_(x)
-        if np.array_equal(members, self.all_members):
+        if members is all_members(len(self.weight)):
             weight.copy_(self.weight)
         else:
             for k, each in zip(members.tolist(), weight, strict=True):
@@ -305,7 +310,6 @@ class FusedNetwork:
         assert isinstance(first, StackedLinear)
         n_members, in_features, _ = first.weight.shape
         self.input = first.weight.new_empty(batch_size, in_features).detach()
-        self.all_members = np.arange(n_members)
         self.hidden: list[Hidden] = []
 
         modules = list(network.layers)
@@ -341,7 +345,7 @@ class FusedNetwork:
         :param members: Compute these networks only
         :return: ``(n_members, batch, n_outputs)``, valid until the next call
         """
-        chosen = self.all_members if members is None else np.array(members)
+        chosen = all_members(len(self.grad_input)) if members is None else np.array(members)
         x = th.cat((features, actions), dim=1, out=self.input)
         for layer in self.hidden:
             x = layer.forward(x, chosen)

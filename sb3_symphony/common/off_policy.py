@@ -179,14 +179,14 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
     def _setup_model(self) -> None:
         self._check_arguments()
         n_steps, given_class, given = self.n_steps, self.replay_buffer_class, self.replay_buffer_kwargs
-        if isinstance(self.observation_space, spaces.Dict) and n_steps > 1:
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        if is_dict and n_steps > 1:
             raise ValueError(f"n_steps={n_steps}: expected 1 for Dict observations, as in SB3")
         chosen = given_class
         if chosen is None:
             for_dict, for_n_steps, otherwise = self.default_buffers
-            is_dict = isinstance(self.observation_space, spaces.Dict)
             self.replay_buffer_class = chosen = for_dict if is_dict else for_n_steps if n_steps > 1 else otherwise
-        if isinstance(self.observation_space, spaces.Dict) and not issubclass(chosen, DictReplayBuffer):
+        if is_dict and not issubclass(chosen, DictReplayBuffer):
             raise ValueError(f"replay_buffer_class={chosen.__name__}: expected one for Dict observations")
         if "fade_factor" in given and not issubclass(chosen, FADING_BUFFERS):
             raise ValueError(f"fade_factor={given['fade_factor']!r}: {chosen.__name__} does not fade")
@@ -262,15 +262,15 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         if isinstance(self.replay_buffer, HerReplayBuffer | PrioritizedReplayBuffer):
             # Samples with their real goal come first, not to be cut; priorities change with every update
             updates_per_draw = 1
+        # With gSDE each update has noise of its own, as in SAC
+        longest = 1 if self.use_sde else max(1, MAX_SEGMENT_ROWS // batch_size)
         while gradient_steps > 0:
             draw = min(gradient_steps, updates_per_draw)
             samples = self.replay_buffer.sample(draw * batch_size, env=self._vec_normalize_env, **sample_kwargs)
             start = 0
             while start < draw:
                 until_actor = self.policy_delay - self._n_updates % self.policy_delay
-                length = min(draw - start, until_actor, max(1, MAX_SEGMENT_ROWS // batch_size))
-                if self.use_sde:  # each update has noise of its own, as in SAC
-                    length = 1
+                length = min(draw - start, until_actor, longest)
                 batches = [_rows(samples, (start + i) * batch_size, batch_size) for i in range(length)]
                 yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
@@ -304,12 +304,11 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         """Discount of the bootstrap value: ``gamma`` to the power of the steps summed in ``rewards``."""
         return self.gamma if batch.discounts is None else batch.discounts
 
-    def _log_update(self, n_updates_before: int, logs: dict[str, list[th.Tensor]], noise_std: th.Tensor | float) -> None:
+    def _log_update(self, logs: dict[str, list[th.Tensor]], noise_std: th.Tensor | float) -> None:
         """
         Record the mean of each quantity over the updates of one ``train()`` call: the only transfer off the device; and the
         ratio of updates to environment steps since the log was written.
 
-        :param n_updates_before: ``_n_updates`` when the call began
         :param logs: Log key (without ``train/``) to tensors of one shape, one per update. ``q_values``
             ``(n_critics, batch, 1)`` become ``q_mean`` and ``q_std``, the spread over the critics averaged over the batch
         :param noise_std: Standard deviation of the exploration noise in [-1, 1] action units
@@ -330,7 +329,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         # Steps of the warm-up have no updates
         self._logged_transitions += max(1, self.num_timesteps - max(self._timesteps_at_update, self.learning_starts))
         self._timesteps_at_update = self.num_timesteps
-        self._logged_updates += self._n_updates - n_updates_before
+        self._logged_updates += len(logs["critic_loss"])
         self.logger.record("train/update_ratio", self._logged_updates / self._logged_transitions)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.config import ConfigError, told
 from sb3_symphony.experiment.environment import (
     RunMonitor,
     Wrappers,
@@ -175,11 +175,7 @@ def load_normalization(path: Path, env: VecEnv) -> VecNormalize:
         env.close()
         if isinstance(error, AssertionError):  # shapes
             raise ConfigError(f"{path}: statistics do not fit the environment — {error}") from error
-        raise ConfigError(f"{path}: not statistics of VecNormalize, or damaged — {_told(error)}") from error
-
-
-def _told(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        raise ConfigError(f"{path}: not statistics of VecNormalize, or damaged — {told(error)}") from error
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -229,7 +225,7 @@ def load_model(selection: Selection, device: str = "auto") -> BaseAlgorithm:
             warnings.simplefilter("ignore", DeprecationWarning)  # of old pickles
             return algorithm.load(selection.model, device=device, custom_objects=_substitutes(), buffer_size=1)
     except Exception as error:  # a pickle can fail in any way
-        raise ConfigError(f"{selection.model}: cannot be loaded as a model of {selection.algo} — {_told(error)}") from error
+        raise ConfigError(f"{selection.model}: cannot be loaded as a model of {selection.algo} — {told(error)}") from error
 
 
 def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None:
@@ -245,7 +241,7 @@ def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read — {error.strerror or error}") from None
     except Exception as error:
-        raise ConfigError(f"{path}: not a model saved by Stable-Baselines3, or damaged — {_told(error)}") from None
+        raise ConfigError(f"{path}: not a model saved by Stable-Baselines3, or damaged — {told(error)}") from None
 
     def policies(of: type[BaseAlgorithm]) -> set[str]:
         return {class_.__module__ for class_ in of.policy_aliases.values()}

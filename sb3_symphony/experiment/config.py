@@ -30,13 +30,21 @@ class ConfigError(ValueError):
         super().__init__(" ".join(message.split()))
 
 
+def told(error: Exception) -> str:
+    """
+    :param error: what went wrong in somebody else's code
+    :return: its kind and message
+    """
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
 def reason(error: Exception) -> str:
     """
     :param error: what went wrong in somebody else's code
     :return: its message; with its kind where that alone says little, as of a ``KeyError``
     """
     speaks = isinstance(error, ValueError | TypeError | AssertionError | MemoryError) and str(error)
-    return str(error) if speaks else f"{type(error).__name__}: {error}"
+    return str(error) if speaks else told(error)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

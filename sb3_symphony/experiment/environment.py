@@ -371,7 +371,7 @@ def make_training_env(
     else:
         try:
             env = DummyVecEnv(makers)
-        except NotImplementedError as error:  # a kind of observations
+        except NotImplementedError as error:  # what SB3 raises for Tuple and nested Dict observations
             raise ConfigError(f"{env_id}: {error}") from None
     env.seed(seed)
     try:

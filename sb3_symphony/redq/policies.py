@@ -85,8 +85,6 @@ class REDQPolicy(AveragedActor, SACPolicy):
     ) -> None:
         check_choice("critic_engine", critic_engine, ENGINES)
         check_number("actor_averaging", actor_averaging, 0, 1)
-        for each in layer_norm if isinstance(layer_norm, Sequence) and not isinstance(layer_norm, str) else [layer_norm]:
-            check_choice("layer_norm", each, (True, False))
         check_net_arch(net_arch)  # before the parent, which builds the actor
         self.critic_engine = critic_engine
         # Before the parent, which builds the networks

@@ -214,7 +214,6 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
-        n_updates_before = self._n_updates
         logs: dict[str, list[th.Tensor]] = defaultdict(list)
 
         # The actor and the temperature are frozen inside a segment: one forward pass gives all its next actions
@@ -239,7 +238,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
                 self.policy.average_actor()
 
         action_dist = self.actor.action_dist
-        self._log_update(n_updates_before, logs, noise_std=action_dist.distribution.stddev.detach().mean())
+        self._log_update(logs, noise_std=action_dist.distribution.stddev.detach().mean())
         for name in ("distribution", "gaussian_actions", "_latent_sde"):
             if hasattr(action_dist, name):
                 setattr(action_dist, name, None)  # they hold the last graph, and a policy with one cannot be copied

@@ -214,7 +214,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         stored = self.replay_buffer.size() * self.n_envs
         batch_size = batch_size or min(max(stored // 500, 128), 1024)
 
-        n_updates_before = self._n_updates
         logs: dict[str, list[th.Tensor]] = defaultdict(list)
         if self._n_updates == 0:
             uniform, faded = self.initial_gradient_steps
@@ -223,7 +222,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             self._update(faded, batch_size, logs)
         self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
         self._new_episodes = 0
-        self._log_update(n_updates_before, logs, noise_std(self.action_noise))
+        self._log_update(logs, noise_std(self.action_noise))
 
     def _set_mixes(self) -> None:
         """Weights of the minimum, in the target and for the actor, at the present step."""
