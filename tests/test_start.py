@@ -342,7 +342,8 @@ def kinds(folder, monkeypatch):
 
 
 def test_images_with_evaluations(kinds):
-    argv = [*kinds, "policy:CnnPolicy", "--env-kwargs", "observations:image", "--eval-freq", "30", "--eval-episodes", "1"]
+    argv = [*kinds, "policy:CnnPolicy", "gradient_steps:1", "--env-kwargs", "observations:image"]
+    argv += ["--eval-freq", "30", "--eval-episodes", "1"]
     assert main([*argv, "--algo", "redq"]) == 0
     found = "--algo redq --env Kinds-v0 --gym-packages kinds -n 1".split()
     assert main(["evaluate", *found]) == 0
