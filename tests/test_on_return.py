@@ -1,18 +1,19 @@
-"""Noise and learning rates that follow the returns of training episodes."""
+"""Noise, learning rates and target entropies that follow the returns of training episodes."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import PPO, TD3
+from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_symphony import REDQ, Symphony
-from sb3_symphony.common.callbacks import GreedyEpisodes, QuietOnReturn, SlowOnReturn
+from sb3_symphony.common.callbacks import EntropyOnReturn, GreedyEpisodes, QuietOnReturn, SlowOnReturn
 from sb3_symphony.common.noise import StickyActionNoise
 from sb3_symphony.common.wrappers import RewardScale
 
+NEEDED = {EntropyOnReturn: dict(target_entropies=(-3, -7))}  # arguments without a default
 RETURNS = [0, 20, 100, 150, 200, 300, 400, 60]
 
 
@@ -162,7 +163,65 @@ def test_rates_go_on_alike_from_a_file(tmp_path):
     assert len({critic for _, critic in rest.seen}) > 2
 
 
-@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, GreedyEpisodes])
+class NoteEntropy(BaseCallback):
+    """The target entropy before each step, which is that of the updates before it."""
+
+    def _init_callback(self):
+        self.seen = []
+
+    def _on_rollout_start(self):
+        self.seen.append(self.model.target_entropy)
+
+    def _on_step(self):
+        return True
+
+
+def entropic(algorithm, env, **kwargs):
+    return algorithm("MlpPolicy", env, gradient_steps=1, target_entropy=-2, **kwargs, **SMALL)
+
+
+@pytest.mark.parametrize("algorithm", [REDQ, SAC])
+@pytest.mark.parametrize("targets", [(-3, -7), (-7, -3)])
+def test_target_entropy_follows_the_reported_returns(algorithm, targets):
+    note = NoteEntropy()
+    entropic(algorithm, Returns()).learn(17, callback=[EntropyOnReturn((50, 250), targets, n_episodes=1), note])
+    after_episodes = note.seen[3::2]
+    assert after_episodes == pytest.approx(np.interp(RETURNS, (50, 250), targets)[: len(after_episodes)])
+    assert len(after_episodes) == 7 and note.seen[:3] == [-2] * 3
+
+
+def test_the_coefficient_follows_the_target_entropy():
+    def coefficient(targets):
+        model = entropic(REDQ, Returns(), learning_rate=1e-2, policy_delay=1)
+        model.learn(60, callback=EntropyOnReturn((-2, -1), targets, n_episodes=1))  # reached by every episode
+        return float(model.log_ent_coef.detach().exp())
+
+    # One action that is uniform in [-1, 1] has an entropy of ln 2 nats: more is out of reach, -7 far below it
+    assert coefficient((0, 2)) > 1.2 > 0.8 > coefficient((0, -7))
+
+
+def test_target_entropy_goes_on_alike_from_a_file(tmp_path):
+    whole, rest = NoteEntropy(), NoteEntropy()
+    entropic(REDQ, Returns()).learn(16, callback=[EntropyOnReturn((50, 250), (-3, -7), n_episodes=3), whole])
+    env = Returns()
+    half = entropic(REDQ, env).learn(8, callback=EntropyOnReturn((50, 250), (-3, -7), n_episodes=3))
+    half.save(tmp_path / "half")
+    half.save_replay_buffer(tmp_path / "buffer")
+    loaded = REDQ.load(tmp_path / "half", env=env, device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    env.episode -= 1  # learn() resets the environment once more
+    loaded.learn(8, callback=[EntropyOnReturn((50, 250), (-3, -7), n_episodes=3), rest], reset_num_timesteps=False)
+    assert rest.seen == whole.seen[8:] and len(set(rest.seen)) > 2
+
+
+def test_refuses_a_model_without_target_entropy():
+    fixed = entropic(SAC, Returns(), ent_coef=0.1)
+    for other in (td3(Returns()), fixed, PPO("MlpPolicy", Returns(), device="cpu")):
+        with pytest.raises(TypeError, match=f"expected one that learns its ent_coef.* got {type(other).__name__}"):
+            other.learn(3, callback=EntropyOnReturn((0, 1), (-3, -7)))
+
+
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, EntropyOnReturn, GreedyEpisodes])
 @pytest.mark.parametrize(
     "arguments, message",
     [
@@ -174,7 +233,7 @@ def test_rates_go_on_alike_from_a_file(tmp_path):
 )
 def test_wrong_values(callback, arguments, message):
     with pytest.raises(ValueError, match=message):
-        callback(**arguments)
+        callback(**arguments, **NEEDED.get(callback, {}))
 
 
 def test_wrong_values_of_their_own():
@@ -182,6 +241,8 @@ def test_wrong_values_of_their_own():
         QuietOnReturn((0, 1), independent=(0.2, -0.1))
     with pytest.raises(ValueError, match="factors=0: expected a number > 0"):
         SlowOnReturn((0, 1), factors=(1, 0))
+    with pytest.raises(ValueError, match=r"target_entropies=\(-3,\): expected two numbers"):
+        EntropyOnReturn((0, 1), (-3,))
 
 
 def test_refuses_other_noise():
@@ -191,7 +252,7 @@ def test_refuses_other_noise():
             other.learn(3, callback=QuietOnReturn((0, 1)))
 
 
-@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, GreedyEpisodes])
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, EntropyOnReturn, GreedyEpisodes])
 def test_more_episodes_than_are_kept(callback):
     with pytest.raises(ValueError, match="n_episodes=5: expected at most the model's stats_window_size, 3"):
-        td3(Returns(), stats_window_size=3).learn(10, callback=callback((50, 250)))
+        td3(Returns(), stats_window_size=3).learn(10, callback=callback((50, 250), **NEEDED.get(callback, {})))

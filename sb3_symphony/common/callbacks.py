@@ -410,6 +410,48 @@ class SlowOnReturn(_OnReturn):
         return True
 
 
+class EntropyOnReturn(_OnReturn):
+    """
+    Sets the target entropy of algorithms that learn their entropy coefficient (SAC, TQC, CrossQ, REDQ, DroQ) by what training
+    episodes return. Who acts at random has to walk in a way that bears it, which is a slow one; who walks already may be
+    precise, and gets faster.
+
+    Between the two returns it is interpolated. It is kept in the model: a resumed training goes on alike.
+
+    :param returns: mean return of recent training episodes at which the target begins to change, and at which it has changed,
+        in the environment's units
+    :param target_entropies: target entropies there, in nats (SAC's own: minus the number of actions)
+    :param n_episodes: how many episodes are recent; before there are as many, the target is left as it is
+    :param verbose: see SB3
+    :raises TypeError: at the start of training, if the model does not learn an entropy coefficient
+    :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
+        episodes (``stats_window_size``)
+    """
+
+    def __init__(
+        self,
+        returns: tuple[float, float],
+        target_entropies: tuple[float, float],
+        n_episodes: int = 5,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(returns, n_episodes, verbose)
+        check_pair("target_entropies", target_entropies, "before, after")
+        self.target_entropies = target_entropies
+
+    def _init_callback(self) -> None:
+        super()._init_callback()
+        if getattr(self.model, "ent_coef_optimizer", None) is None:
+            kind = type(self.model).__name__
+            raise TypeError(f"model: expected one that learns its ent_coef, such as SAC with ent_coef='auto', got {kind}")
+
+    def _on_step(self) -> bool:
+        if (recent := self._recent()) is not None:
+            model: Any = self.model
+            model.target_entropy = float(np.interp(recent, self.returns, self.target_entropies))
+        return True
+
+
 class GreedyEpisodes(_OnReturn):
     """
     Lets training episodes act as evaluations do: with the deterministic action, of the averaged actor if there is one, and

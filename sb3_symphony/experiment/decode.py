@@ -46,7 +46,7 @@ _CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
     "features_extractor_class": _EXTRACTORS,
     # None that writes files: a configuration must not choose what is written where
     "callback": {
-        f"{_OURS}.callbacks": ("GreedyEpisodes", "QBiasCallback", "QuietOnReturn", "SlowOnReturn"),
+        f"{_OURS}.callbacks": ("EntropyOnReturn", "GreedyEpisodes", "QBiasCallback", "QuietOnReturn", "SlowOnReturn"),
         f"{_SB3}.callbacks": ("StopTrainingOnMaxEpisodes", "LogEveryNTimesteps"),
     },
     "action_noise": {
