@@ -145,22 +145,28 @@ def test_a_schedule_goes_on_falling():
     assert [seen[0] for seen in note.seen[3::2]] == pytest.approx(expected_rates)
 
 
+def in_one_and_in_two(make, callback, note, tmp_path):
+    """What is noted in eight episodes, and in the last four of them where the model comes from a file in between."""
+    whole, rest = note(), note()
+    make(Returns()).learn(16, callback=[callback(), whole])
+    env = Returns()
+    half = make(env).learn(8, callback=callback())
+    half.save(tmp_path / "half")
+    half.save_replay_buffer(tmp_path / "buffer")
+    loaded = type(half).load(tmp_path / "half", env=env, device="cpu")
+    loaded.load_replay_buffer(tmp_path / "buffer")
+    env.episode -= 1  # learn() resets the environment once more
+    loaded.learn(8, callback=[callback(), rest], reset_num_timesteps=False)
+    return whole.seen, rest.seen
+
+
 def test_rates_go_on_alike_from_a_file(tmp_path):
     def model(env):
         return Symphony("MlpPolicy", env, learning_rate=1e-3, critic_learning_rate=2e-3, **SYMPHONY)
 
-    whole, rest = NoteRates(), NoteRates()
-    model(Returns()).learn(16, callback=[SlowOnReturn((50, 250), n_episodes=3), whole])
-    env = Returns()
-    half = model(env).learn(8, callback=SlowOnReturn((50, 250), n_episodes=3))
-    half.save(tmp_path / "half")
-    half.save_replay_buffer(tmp_path / "buffer")
-    loaded = Symphony.load(tmp_path / "half", env=env, device="cpu")
-    loaded.load_replay_buffer(tmp_path / "buffer")
-    env.episode -= 1  # learn() resets the environment once more
-    loaded.learn(8, callback=[SlowOnReturn((50, 250), n_episodes=3), rest], reset_num_timesteps=False)
-    assert rest.seen == whole.seen[8:] and len(rest.seen) == 8
-    assert len({critic for _, critic in rest.seen}) > 2
+    whole, rest = in_one_and_in_two(model, lambda: SlowOnReturn((50, 250), n_episodes=3), NoteRates, tmp_path)
+    assert rest == whole[8:] and len(rest) == 8
+    assert len({critic for _, critic in rest}) > 2
 
 
 class NoteEntropy(BaseCallback):
@@ -201,17 +207,12 @@ def test_the_coefficient_follows_the_target_entropy():
 
 
 def test_target_entropy_goes_on_alike_from_a_file(tmp_path):
-    whole, rest = NoteEntropy(), NoteEntropy()
-    entropic(REDQ, Returns()).learn(16, callback=[EntropyOnReturn((50, 250), (-3, -7), n_episodes=3), whole])
-    env = Returns()
-    half = entropic(REDQ, env).learn(8, callback=EntropyOnReturn((50, 250), (-3, -7), n_episodes=3))
-    half.save(tmp_path / "half")
-    half.save_replay_buffer(tmp_path / "buffer")
-    loaded = REDQ.load(tmp_path / "half", env=env, device="cpu")
-    loaded.load_replay_buffer(tmp_path / "buffer")
-    env.episode -= 1  # learn() resets the environment once more
-    loaded.learn(8, callback=[EntropyOnReturn((50, 250), (-3, -7), n_episodes=3), rest], reset_num_timesteps=False)
-    assert rest.seen == whole.seen[8:] and len(set(rest.seen)) > 2
+    def callback():
+        return EntropyOnReturn((50, 250), (-3, -7), n_episodes=3)
+
+    whole, rest = in_one_and_in_two(lambda env: entropic(REDQ, env), callback, NoteEntropy, tmp_path)
+    assert rest == whole[8:] and len(rest) == 8
+    assert len(set(rest)) > 2
 
 
 def test_refuses_a_model_without_target_entropy():
