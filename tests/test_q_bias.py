@@ -13,7 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sb3_symphony import REDQ, DroQ, Symphony
 from sb3_symphony.cli import main
-from sb3_symphony.common.callbacks import QBiasCallback, monte_carlo_returns, q_bias
+from sb3_symphony.common.q_bias import QBiasCallback, monte_carlo_returns, q_bias
 
 ALGORITHMS = [TD3, DDPG, SAC, TQC, CrossQ, Symphony, REDQ, DroQ]
 GAMMA = 0.9

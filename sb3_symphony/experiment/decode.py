@@ -46,7 +46,8 @@ _CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
     "features_extractor_class": _EXTRACTORS,
     # None that writes files: a configuration must not choose what is written where
     "callback": {
-        f"{_OURS}.callbacks": ("EntropyOnReturn", "GreedyEpisodes", "QBiasCallback", "QuietOnReturn", "SlowOnReturn"),
+        f"{_OURS}.callbacks": ("EntropyOnReturn", "GreedyEpisodes", "QuietOnReturn", "SlowOnReturn"),
+        f"{_OURS}.q_bias": ("QBiasCallback",),
         f"{_SB3}.callbacks": ("StopTrainingOnMaxEpisodes", "LogEveryNTimesteps"),
     },
     "action_noise": {
