@@ -40,6 +40,14 @@ class _OnReturn(BaseCallback):
         if self.n_episodes > kept:
             raise ValueError(f"n_episodes={self.n_episodes!r}: expected at most the model's stats_window_size, {kept}")
 
+    def _on_step(self) -> bool:
+        if (recent := self._recent()) is not None:
+            self._follow(recent)
+        return True
+
+    def _follow(self, recent: float) -> None:
+        """Set what depends on the mean return of recent episodes."""
+
     def _recent(self, *latest: float) -> float | None:
         """The mean return, ``None`` before there are as many; ``latest`` is one that the model has not noted yet."""
         noted = self.model.ep_info_buffer or ()
@@ -90,11 +98,9 @@ class QuietOnReturn(_OnReturn):
         super()._init_callback()
         self._noises()
 
-    def _on_step(self) -> bool:
-        if (recent := self._recent()) is not None:
-            for noise in self._noises():
-                noise.independent = float(np.interp(recent, self.returns, self.independent))
-        return True
+    def _follow(self, recent: float) -> None:
+        for noise in self._noises():
+            noise.independent = float(np.interp(recent, self.returns, self.independent))
 
 
 class _ScaledSchedule:
@@ -136,14 +142,12 @@ class SlowOnReturn(_OnReturn):
         check_pair("factors", factors, "before, after", 0, exclusive=True)
         self.factors = factors
 
-    def _on_step(self) -> bool:
-        if (recent := self._recent()) is not None:
-            factor = float(np.exp(np.interp(recent, self.returns, np.log(self.factors))))
-            self.model._setup_lr_schedule()  # as they were given
-            for name in ("lr_schedule", "critic_lr_schedule"):  # Symphony's critics have their own
-                if hasattr(self.model, name):
-                    setattr(self.model, name, FloatSchedule(_ScaledSchedule(getattr(self.model, name), factor)))
-        return True
+    def _follow(self, recent: float) -> None:
+        factor = float(np.exp(np.interp(recent, self.returns, np.log(self.factors))))
+        self.model._setup_lr_schedule()  # as they were given
+        for name in ("lr_schedule", "critic_lr_schedule"):  # Symphony's critics have their own
+            if hasattr(self.model, name):
+                setattr(self.model, name, FloatSchedule(_ScaledSchedule(getattr(self.model, name), factor)))
 
 
 class EntropyOnReturn(_OnReturn):
@@ -181,11 +185,9 @@ class EntropyOnReturn(_OnReturn):
             kind = type(self.model).__name__
             raise TypeError(f"model: expected one that learns its ent_coef, such as SAC with ent_coef='auto', got {kind}")
 
-    def _on_step(self) -> bool:
-        if (recent := self._recent()) is not None:
-            model: Any = self.model
-            model.target_entropy = float(np.interp(recent, self.returns, self.target_entropies))
-        return True
+    def _follow(self, recent: float) -> None:
+        model: Any = self.model
+        model.target_entropy = float(np.interp(recent, self.returns, self.target_entropies))
 
 
 class GreedyEpisodes(_OnReturn):
