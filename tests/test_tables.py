@@ -114,8 +114,24 @@ def test_what_is_not_done_or_not_standard_is_told(result):
     assert c["seeds"] == "not run yet" and c["S300 median"] == c["updates"] == "–"
     assert "- non-standard: evaluated every 1 000 steps on 1 episode" in notes
     assert "- not done, and not in these numbers: a 1, a 2" in notes
-    half_way = result("d", 0, [], [0, 0, 0], done=False)
-    assert table_of([half_way])[0][0]["steps"] == "1 500 so far"
+
+
+def test_rows_of_which_no_run_is_done_tell_how_far_they_have_come(result):
+    results = [
+        result("a", 0, [310, 310], [0, 301, 0], done=False),
+        result("a", 1, [310], [0, 0], done=False),
+        result("a", 2, [], [], done=False),
+        result("b", 0, [310, 310], [301], final=[1.0]),
+    ]
+    (a, _), notes = table_of(results)
+    assert (a["seeds"], a["steps"]) == ("0 of 3", "1 500 so far")
+    assert a["S300 median"] == "> 1 000"  # 1000, > 1000
+    assert a["E300"] == "> 2 (> 1 000)"  # episodes 2, > 2
+    assert a["T300"] == "> 2 (> 1 250)"  # > 3, > 2
+    assert a["maximum"] == "310.0 (310.0)"
+    assert {a[name] for name in ("final IQM (95 % CI)", "final episodes", "final length", "updates", "wall-clock")} == {"–"}
+    assert "- not done, and in these numbers as far as they have come: a 0, a 1" in notes
+    assert "- not done, and not in these numbers: a 2" in notes
 
 
 def test_only_columns_that_say_something(result):

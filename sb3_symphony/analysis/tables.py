@@ -2,7 +2,8 @@
 Results of a grid as tables: one CSV row per episode, one per run, and a Markdown table for each environment.
 
 What the columns of the Markdown table mean is said under it. A run that ended before an event is censored, and a number that
-depends on what it would have done is written "> n".
+depends on what it would have done is written "> n". Numbers are those of the runs that are done; where none is, they tell how
+far those have come that have begun.
 """
 
 import csv
@@ -307,26 +308,26 @@ def _columns(results: Sequence[Result]) -> list[Column]:
             ("final length", _final_length),
         ]
     columns += [
-        ("updates", lambda done: _number(np.median([_summary(each)["updates"] for each in done]))),
-        ("wall-clock", lambda done: _duration(float(np.median([_summary(each)["seconds"] for each in done])))),
+        ("updates", lambda done: _of_summaries(done, "updates", _number)),
+        ("wall-clock", lambda done: _of_summaries(done, "seconds", _duration)),
     ]
     return columns
 
 
-def _steps_so_far(results: Sequence[Result]) -> str:
-    steps = [
-        each.run.episodes.steps[-1] for each in results if each.run and each.run.episodes and len(each.run.episodes.steps)
-    ]
-    return f"{_number(max(steps))} so far" if steps else _NOTHING
+def _of_summaries(done: Sequence[Result], name: str, write: Callable[[float], str]) -> str:
+    """Median of what is known of runs that are done."""
+    values = [each.summary[name] for each in done if each.summary is not None]
+    return write(float(np.median(values))) if values else _NOTHING
+
+
+def _so_far(result: Result) -> int:
+    """Steps of a run whose episodes are over; 0 if there is none yet."""
+    episodes = result.run.episodes if result.run else None
+    return int(episodes.steps[-1]) if episodes is not None and len(episodes.steps) else 0
 
 
 def _steps(done: Sequence[Result]) -> tuple[list[int], list[bool]]:
     return [each.events.stable.step for each in done], [each.events.stable.reached for each in done]
-
-
-def _summary(result: Result) -> dict[str, Any]:
-    assert result.summary is not None
-    return result.summary
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -345,6 +346,33 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     return [lines[0], rule, *lines[1:]]
 
 
+def _by_algorithm(results: Sequence[Result]) -> dict[str, list[Result]]:
+    rows: dict[str, list[Result]] = {}
+    for each in results:
+        rows.setdefault(each.algorithm, []).append(each)
+    return rows
+
+
+def _told_of(row: Sequence[Result]) -> list[Result]:
+    """The runs whose numbers a row has: those that are done; if none is, those that have come somewhere."""
+    return [each for each in row if each.summary is not None] or [each for each in row if _so_far(each)]
+
+
+def _unfinished(results: Sequence[Result]) -> dict[str, list[Result]]:
+    """Runs that are not done, of all rows that have been begun."""
+    without: list[Result] = []
+    within: list[Result] = []
+    for row in _by_algorithm(results).values():
+        told_of = _told_of(row)
+        if any(each.run is not None for each in row):
+            without += [each for each in row if each not in told_of]
+            within += [each for each in told_of if each.summary is None]
+    return {
+        "not done, and not in these numbers": without,
+        "not done, and in these numbers as far as they have come": within,
+    }
+
+
 def markdown_table(results: Sequence[Result]) -> str:
     """
     :param results: runs on one environment, in the order of its rows
@@ -353,16 +381,18 @@ def markdown_table(results: Sequence[Result]) -> str:
     columns = _columns(results)
     told = any(each.reported for each in results)
     rows = [["algorithm", "seeds", "steps", *(name for name, _ in columns), *["reported"] * told]]
-    for algorithm in dict.fromkeys(each.algorithm for each in results):
-        own = [each for each in results if each.algorithm == algorithm]
-        done = [each for each in own if each.summary is not None]
+    for algorithm, own in _by_algorithm(results).items():
+        told_of = _told_of(own)
+        done = [each.summary for each in own if each.summary is not None]
         mark = "" if all(each.standard for each in own if each.run) else " (non-standard)"
         seeds = f"{len(done)}" if len(done) == len(own) else f"{len(done)} of {len(own)}"
         if all(each.run is None for each in own):
             seeds = "not run yet"
-        steps = " or ".join(_number(n) for n in sorted({_summary(each)["steps"] for each in done})) or _steps_so_far(own)
-        cells = [write(done) if done else _NOTHING for _, write in columns]
-        rows.append([algorithm + mark, seeds, steps, *cells, *[own[0].reported or _NOTHING] * told])
+        steps = " or ".join(map(_number, sorted({summary["steps"] for summary in done})))
+        if told_of and not done:
+            steps = f"{_number(max(map(_so_far, told_of)))} so far"
+        cells = [write(told_of) if told_of else _NOTHING for _, write in columns]
+        rows.append([algorithm + mark, seeds, steps or _NOTHING, *cells, *[own[0].reported or _NOTHING] * told])
     names = [name for name, _ in columns]
     return "\n".join([f"### {results[0].environment}", "", *aligned(rows), "", *_meaning(results, names), ""])
 
@@ -400,10 +430,9 @@ def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     other = sorted({_protocol(each.run) for each in results if each.run is not None and not each.standard})
     lines += [f"- non-standard: {protocol}" for protocol in other]
     lines += _repeated(results)
-    begun = {each.algorithm for each in results if each.run is not None}
-    missing = [f"{each.algorithm} {each.seed}" for each in results if each.summary is None and each.algorithm in begun]
-    if missing:
-        lines.append(f"- not done, and not in these numbers: {', '.join(missing)}")
+    for what, some in _unfinished(results).items():
+        if some:
+            lines.append(f"- {what}: {', '.join(f'{each.algorithm} {each.seed}' for each in some)}")
     return lines
 
 
