@@ -114,6 +114,8 @@ def test_what_is_not_done_or_not_standard_is_told(result):
     assert c["seeds"] == "not run yet" and c["S300 median"] == c["updates"] == "–"
     assert "- non-standard: evaluated every 1 000 steps on 1 episode" in notes
     assert "- not done, and not in these numbers: a 1, a 2" in notes
+    half_way = result("d", 0, [], [0, 0, 0], done=False)
+    assert table_of([half_way])[0][0]["steps"] == "1 500 so far"
 
 
 def test_rows_of_which_no_run_is_done_tell_how_far_they_have_come(result):

@@ -255,31 +255,31 @@ def _stable_iqm(events: Sequence[Event]) -> str:
     return f"{_bound(mean)} ({_bound(low)} … {_bound(high)})" if len(events) > 1 else _bound(mean)
 
 
-def _unstable(done: Sequence[Result]) -> str:
-    failed, counted = (sum(getattr(each.events, name) for each in done) for name in ("unstable", "unstable_of"))
+def _unstable(runs: Sequence[Result]) -> str:
+    failed, counted = (sum(getattr(each.events, name) for each in runs) for name in ("unstable", "unstable_of"))
     return f"{failed} / {counted}" if counted else _NOTHING
 
 
-def _maximum(done: Sequence[Result]) -> str:
-    best = [each.events.best_evaluation for each in done if math.isfinite(each.events.best_evaluation)]
+def _maximum(runs: Sequence[Result]) -> str:
+    best = [each.events.best_evaluation for each in runs if math.isfinite(each.events.best_evaluation)]
     return f"{np.median(best):.1f} ({max(best):.1f})" if best else _NOTHING
 
 
-def _final_iqm(done: Sequence[Result]) -> str:
-    means = [each.final.mean() for each in done if len(each.final)]
+def _final_iqm(runs: Sequence[Result]) -> str:
+    means = [each.final.mean() for each in runs if len(each.final)]
     if not means:
         return _NOTHING
     summary = summarise(means)
     return f"{summary.iqm:.1f} ({summary.low:.1f} … {summary.high:.1f})" if len(means) > 1 else f"{summary.iqm:.1f}"
 
 
-def _final_episodes(done: Sequence[Result]) -> str:
-    returns = np.concatenate([each.final for each in done])
+def _final_episodes(runs: Sequence[Result]) -> str:
+    returns = np.concatenate([each.final for each in runs])
     return f"{returns.mean():.1f} ± {returns.std():.1f}, {iqm(returns):.1f}" if len(returns) else _NOTHING
 
 
-def _final_length(done: Sequence[Result]) -> str:
-    lengths = np.concatenate([each.final_lengths for each in done])
+def _final_length(runs: Sequence[Result]) -> str:
+    lengths = np.concatenate([each.final_lengths for each in runs])
     return f"{_number(lengths.mean())} ± {_number(lengths.std())}" if len(lengths) else _NOTHING
 
 
@@ -293,10 +293,10 @@ def _columns(results: Sequence[Result]) -> list[Column]:
     if thresholds.solved is not None:
         name = f"{thresholds.solved:g}"
         columns += [
-            (f"S{name} median", lambda done: _bound(median_event(*_steps(done)))),
-            (f"S{name} IQM (95 % CI)", lambda done: _stable_iqm([each.events.stable for each in done])),
-            (f"E{name}", lambda done: _median_of([each.events.episode for each in done])),
-            (f"T{name}", lambda done: _median_of([each.events.trailing for each in done])),
+            (f"S{name} median", lambda runs: _bound(median_event(*_steps(runs)))),
+            (f"S{name} IQM (95 % CI)", lambda runs: _stable_iqm([each.events.stable for each in runs])),
+            (f"E{name}", lambda runs: _median_of([each.events.episode for each in runs])),
+            (f"T{name}", lambda runs: _median_of([each.events.trailing for each in runs])),
         ]
         if thresholds.unstable_below is not None:
             columns.append(("unstable", _unstable))
@@ -308,15 +308,15 @@ def _columns(results: Sequence[Result]) -> list[Column]:
             ("final length", _final_length),
         ]
     columns += [
-        ("updates", lambda done: _of_summaries(done, "updates", _number)),
-        ("wall-clock", lambda done: _of_summaries(done, "seconds", _duration)),
+        ("updates", lambda runs: _of_summaries(runs, "updates", _number)),
+        ("wall-clock", lambda runs: _of_summaries(runs, "seconds", _duration)),
     ]
     return columns
 
 
-def _of_summaries(done: Sequence[Result], name: str, write: Callable[[float], str]) -> str:
+def _of_summaries(runs: Sequence[Result], name: str, write: Callable[[float], str]) -> str:
     """Median of what is known of runs that are done."""
-    values = [each.summary[name] for each in done if each.summary is not None]
+    values = [each.summary[name] for each in runs if each.summary is not None]
     return write(float(np.median(values))) if values else _NOTHING
 
 
@@ -326,8 +326,8 @@ def _so_far(result: Result) -> int:
     return int(episodes.steps[-1]) if episodes is not None and len(episodes.steps) else 0
 
 
-def _steps(done: Sequence[Result]) -> tuple[list[int], list[bool]]:
-    return [each.events.stable.step for each in done], [each.events.stable.reached for each in done]
+def _steps(runs: Sequence[Result]) -> tuple[list[int], list[bool]]:
+    return [each.events.stable.step for each in runs], [each.events.stable.reached for each in runs]
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -360,16 +360,11 @@ def _told_of(row: Sequence[Result]) -> list[Result]:
 
 def _unfinished(results: Sequence[Result]) -> dict[str, list[Result]]:
     """Runs that are not done, of all rows that have been begun."""
-    without: list[Result] = []
-    within: list[Result] = []
-    for row in _by_algorithm(results).values():
-        told_of = _told_of(row)
-        if any(each.run is not None for each in row):
-            without += [each for each in row if each not in told_of]
-            within += [each for each in told_of if each.summary is None]
+    begun = [row for row in _by_algorithm(results).values() if any(each.run is not None for each in row)]
+    told_of = [each for row in begun for each in _told_of(row)]
     return {
-        "not done, and not in these numbers": without,
-        "not done, and in these numbers as far as they have come": within,
+        "not done, and not in these numbers": [each for row in begun for each in row if each not in told_of],
+        "not done, and in these numbers as far as they have come": [each for each in told_of if each.summary is None],
     }
 
 
