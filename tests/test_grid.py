@@ -169,6 +169,16 @@ def test_raw_results_suffice_for_the_report(whole, folder):
         assert (folder / "raw" / name).read_bytes() == (whole / name).read_bytes()
 
 
+def test_curves_are_drawn_of_unfinished_runs_too(whole, folder):
+    shutil.copytree(whole, folder / "results")
+    for name in CELLS:
+        (folder / "results" / name / "result.json").unlink()
+    assert main(["bench", str(whole.parent / "study.yml"), "-f", "results", "--report"]) == 0
+    for name in ("evaluations.png", "training.png"):
+        assert (folder / "results" / name).read_bytes() == (whole / name).read_bytes()
+    assert re.search(r"td3 \(non-standard\) +\| 0 of 3 ", (folder / "results" / "table.md").read_text())
+
+
 def test_dry_run(whole, folder, capsys):
     study = str(whole.parent / "study.yml")
     assert main(["bench", study, "--dry-run"]) == 0

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from sb3_symphony.analysis.statistics import summarise
 from sb3_symphony.analysis.style import house_style, line_style, name_lines, new_figure, note, save
-from sb3_symphony.analysis.tables import Result, Row, aligned
+from sb3_symphony.analysis.tables import Result, Row, aligned, by_algorithm
 
 
 def _returns(result: Result, name: str) -> np.ndarray | None:
@@ -43,10 +43,6 @@ def _entries(results: Sequence[Result], name: str) -> np.ndarray | None:
     return np.concatenate(returns) if returns else None
 
 
-def _by_algorithm(results: Sequence[Result]) -> dict[str, list[Result]]:
-    return {name: [each for each in results if each.algorithm == name] for name in dict.fromkeys(r.algorithm for r in results)}
-
-
 def matrix_table(results: Sequence[Result], names: Sequence[str], label: str) -> str:
     """
     :param results: runs on one environment, in the order of its rows
@@ -55,7 +51,7 @@ def matrix_table(results: Sequence[Result], names: Sequence[str], label: str) ->
     :return: heading and table of mean ± standard deviation over all episodes of all seeds
     """
     rows = [[f"{label}:", *names]]
-    for algorithm, own in _by_algorithm(results).items():
+    for algorithm, own in by_algorithm(results).items():
         entries = [_entries(own, name) for name in names]
         rows.append([algorithm, *("–" if each is None else f"{each.mean():.0f} ± {each.std():.0f}" for each in entries)])
     lines = [
@@ -88,7 +84,7 @@ def plot_matrix(results: Sequence[Result], names: Sequence[str], label: str, out
     several = len({each.environment for each in results}) > 1
     rows: dict[str, list[np.ndarray | None]] = {}
     for environment in dict.fromkeys(each.environment for each in results):
-        for algorithm, own in _by_algorithm([each for each in results if each.environment == environment]).items():
+        for algorithm, own in by_algorithm([each for each in results if each.environment == environment]).items():
             entries = [_entries(own, name) for name in names]
             if any(each is not None for each in entries):
                 rows[f"{algorithm} on {environment}" if several else algorithm] = entries

@@ -346,25 +346,32 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     return [lines[0], rule, *lines[1:]]
 
 
-def _by_algorithm(results: Sequence[Result]) -> dict[str, list[Result]]:
+def by_algorithm(results: Iterable[Result]) -> dict[str, list[Result]]:
+    """
+    :param results: runs
+    :return: name of each variant → its runs, in the order given
+    """
     rows: dict[str, list[Result]] = {}
     for each in results:
         rows.setdefault(each.algorithm, []).append(each)
     return rows
 
 
-def _told_of(row: Sequence[Result]) -> list[Result]:
-    """The runs whose numbers a row has: those that are done; if none is, those that have come somewhere."""
+def told_of(row: Sequence[Result]) -> list[Result]:
+    """
+    :param row: runs of one variant
+    :return: those that tables and curves are made of: those that are done; if none is, those that have come somewhere
+    """
     return [each for each in row if each.summary is not None] or [each for each in row if _so_far(each)]
 
 
 def _unfinished(results: Sequence[Result]) -> dict[str, list[Result]]:
     """Runs that are not done, of all rows that have been begun."""
-    begun = [row for row in _by_algorithm(results).values() if any(each.run is not None for each in row)]
-    told_of = [each for row in begun for each in _told_of(row)]
+    begun = [row for row in by_algorithm(results).values() if any(each.run is not None for each in row)]
+    told = [each for row in begun for each in told_of(row)]
     return {
-        "not done, and not in these numbers": [each for row in begun for each in row if each not in told_of],
-        "not done, and in these numbers as far as they have come": [each for each in told_of if each.summary is None],
+        "not done, and not in these numbers": [each for row in begun for each in row if each not in told],
+        "not done, and in these numbers as far as they have come": [each for each in told if each.summary is None],
     }
 
 
@@ -374,20 +381,20 @@ def markdown_table(results: Sequence[Result]) -> str:
     :return: heading, table and what its columns mean
     """
     columns = _columns(results)
-    told = any(each.reported for each in results)
-    rows = [["algorithm", "seeds", "steps", *(name for name, _ in columns), *["reported"] * told]]
-    for algorithm, own in _by_algorithm(results).items():
-        told_of = _told_of(own)
+    reported = any(each.reported for each in results)
+    rows = [["algorithm", "seeds", "steps", *(name for name, _ in columns), *["reported"] * reported]]
+    for algorithm, own in by_algorithm(results).items():
+        told = told_of(own)
         done = [each.summary for each in own if each.summary is not None]
         mark = "" if all(each.standard for each in own if each.run) else " (non-standard)"
         seeds = f"{len(done)}" if len(done) == len(own) else f"{len(done)} of {len(own)}"
         if all(each.run is None for each in own):
             seeds = "not run yet"
         steps = " or ".join(map(_number, sorted({summary["steps"] for summary in done})))
-        if told_of and not done:
-            steps = f"{_number(max(map(_so_far, told_of)))} so far"
-        cells = [write(told_of) if told_of else _NOTHING for _, write in columns]
-        rows.append([algorithm + mark, seeds, steps or _NOTHING, *cells, *[own[0].reported or _NOTHING] * told])
+        if told and not done:
+            steps = f"{_number(max(map(_so_far, told)))} so far"
+        cells = [write(told) if told else _NOTHING for _, write in columns]
+        rows.append([algorithm + mark, seeds, steps or _NOTHING, *cells, *[own[0].reported or _NOTHING] * reported])
     names = [name for name, _ in columns]
     return "\n".join([f"### {results[0].environment}", "", *aligned(rows), "", *_meaning(results, names), ""])
 

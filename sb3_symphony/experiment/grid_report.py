@@ -179,9 +179,10 @@ def _thresholds(environment: Environment) -> Any:
 
 
 def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
-    """Learning curves of the runs that are done."""
+    """Learning curves of the runs that the tables tell of."""
     from sb3_symphony.analysis.plots import episode_curve, evaluation_curve, plot_curves, summarised
     from sb3_symphony.analysis.runs import NotRecorded, Run
+    from sb3_symphony.analysis.tables import by_algorithm, told_of
 
     def line(kind: str, run: Run) -> Any:
         return evaluation_curve(run, "steps", "reward") if kind == "evaluations" else episode_curve(run, "steps", "reward", 20)
@@ -191,9 +192,8 @@ def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
         panels: dict[str, list[Any]] = {}
         for results in by_environment:
             lines: dict[str, list[Any]] = {}
-            for each in results:
-                if each.run is None or each.summary is None:
-                    continue
+            for each in (each for row in by_algorithm(results).values() for each in told_of(row)):
+                assert each.run is not None
                 try:
                     x, y = line(kind, each.run)
                 except NotRecorded:
