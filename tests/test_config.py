@@ -140,6 +140,14 @@ def test_zoo_noise():
     noise = decode("td3", noise_type="normal", noise_std=0.3)["action_noise"]
     assert isinstance(noise, NormalActionNoise)
     np.testing.assert_array_equal(noise._sigma, np.full(4, 0.3))
+
+
+def test_action_noise():
+    for name in ("NormalActionNoise", "OrnsteinUhlenbeckActionNoise", "StickyActionNoise", "PinkActionNoise"):
+        value = {name: {"sigma": 0.3}}
+        noise = decode("sac", action_noise=value)["action_noise"]
+        assert type(noise).__name__ == name and noise().shape == (4,)
+        assert value == {name: {"sigma": 0.3}}  # the run folder keeps what was written, in plain values
     assert decode("symphony", action_noise="default")["action_noise"] == "default"
     assert decode("symphony", action_noise=None)["action_noise"] is None
 

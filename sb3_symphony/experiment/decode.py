@@ -280,9 +280,9 @@ def _named_classes(key: str, value: Any) -> Any:
 def _action_noise(value: Any, n_actions: int | tuple[int, ...], n_envs: int) -> Any:
     """``{StickyActionNoise: {sigma: 0.3}}`` → that noise for this action space."""
     name, arguments = next(iter(value.items())) if isinstance(value, dict) and len(value) == 1 else (value, {})
-    arguments = {} if arguments is None else arguments
-    if not (isinstance(name, str) and isinstance(arguments, dict)):
+    if not (isinstance(name, str) and isinstance(arguments, dict | None)):
         raise ConfigError(f"action_noise: {value!r} — expected {{NameOfTheNoise: {{sigma: 0.3}}}}")
+    arguments = dict(arguments or {})  # the configuration is written as it is
     class_ = class_by_name("action_noise", name)
     types = argument_types(class_)
     filled = {"n_actions": n_actions, "n_envs": n_envs}
