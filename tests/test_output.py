@@ -53,6 +53,7 @@ def test_bad_names(folder):
         (lambda: output_file("new/", "-o"), "-o: 'new/' cannot be written — it is a folder"),
         (lambda: output_file("no/a", "-o"), "-o: 'no/a' cannot be written — there is no folder no"),
         (lambda: output_file("a" * 300, "-o"), f"-o: '{'a' * 300}' cannot be written — File name too long"),
+        (lambda: output_file("/dev/null", "-o"), "-o: '/dev/null' cannot be written — it is no regular file"),
         (lambda: output_folder("file", "-o"), "-o: 'file' cannot be written — File exists"),
         (lambda: output_folder("file/below", "-o"), "-o: 'file/below' cannot be written — Not a directory"),
     ):
@@ -84,3 +85,6 @@ def test_writing(folder):
     (folder / "out").write_bytes(b"before")
     write_output(folder / "out", b"after", "-o")
     assert (folder / "out").read_bytes() == b"after" and len(list(folder.iterdir())) == 1
+    (folder / "link").symlink_to("out")
+    write_output(folder / "link", b"through", "-o")
+    assert (folder / "link").is_symlink() and (folder / "out").read_bytes() == b"through"

@@ -97,6 +97,7 @@ def test_quick(write, tmp_path):
         ({"seed": 3}, "unknown option 'seed': did you mean 'seeds'?"),
         ({"seeds": []}, "seeds: [] — expected at least one"),
         ({"seeds": 0}, "seeds: 0 — expected at least one"),
+        ({"seeds": 20_240_101}, "seeds: 20240101 — expected how many seeds, or a list of them: [20240101] is one seed"),
         ({"seeds": [1, 2, 1]}, "seeds: 1 is there 2 times — expected every cell once"),
         ({"seeds": [-1]}, "seeds: [-1] — expected a number >= 0"),
         ({"seeds": "many"}, "seeds: 'many' — expected a list"),

@@ -29,10 +29,11 @@ def write_atomically(path: Path, content: bytes) -> None:
     """
     Write a file that is there completely or not at all, whenever the process or the machine stops.
 
-    :param path: the file
+    :param path: the file, or a link to it
     :param content: its content
     :raises OSError: if it cannot be written; a file that was there before stays as it was
     """
+    path = path.resolve()
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:

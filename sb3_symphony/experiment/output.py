@@ -32,6 +32,8 @@ def output_file(name: str | Path, flag: str, suffixes: Sequence[str] = ()) -> Pa
     try:
         if path.is_dir() or str(name).endswith(("/", os.sep)):
             problem = "it is a folder"
+        elif path.exists() and not path.is_file():  # a device or a pipe, which would be replaced
+            problem = "it is no regular file"
         elif not path.parent.is_dir():
             problem = f"there is no folder {path.parent}"
     except OSError as error:  # such as a name that is too long

@@ -46,9 +46,17 @@ def _part(model: type[BaseModel], name: str | None, value: Any) -> Any:
     return validated(model, value)
 
 
+#: a larger number is taken for a seed
+_MOST_SEEDS = 10_000
+
+
 def _seeds(value: Any) -> Any:
     """``10`` means 0 to 9."""
-    return list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
+    if not isinstance(value, int) or isinstance(value, bool):
+        return value
+    if value > _MOST_SEEDS:
+        raise ValueError(f"expected how many seeds, or a list of them: [{value}] is one seed")
+    return list(range(value))
 
 
 def _some(value: Any) -> Any:
