@@ -414,6 +414,13 @@ def test_another_machine(killed, monkeypatch, capsys):
     assert "(resumed at 200; not bit for bit: threads 1 before, 7 now)" in capsys.readouterr().out
 
 
+def test_run_whose_old_place_cannot_be_made(killed, folder):
+    run = killed(230, options(log_folder="b"))
+    (folder / "b").rename("c")
+    (folder / "b").touch()
+    resume(folder / "c" / run.relative_to("b"))
+
+
 def test_one_process_at_a_time(killed, capsys):
     run = killed(230, options())
     capsys.readouterr()

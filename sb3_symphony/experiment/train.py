@@ -333,6 +333,8 @@ def train(options: TrainOptions, command: str | None = None, folder: Path | None
         stored = open_run(options)
         if stored.finished:
             return TrainResult(stored.run, stored.steps, [], 0.0, untouched=True)
+        for written in (stored.run.path, stored.run.checkpoints):
+            check_folder(written, "--resume")
         cleanup.enter_context(_alone(stored.run))
         return _train(stored.options, stored.config, command, cleanup, stored.run, stored.checkpoint())
 
@@ -351,7 +353,8 @@ def _train(
     if options.num_threads > 0:
         th.set_num_threads(options.num_threads)
 
-    check_folder(options.log_folder if folder is None else folder.parent, "--log-folder")
+    if run is None:  # else it may have been moved, and its folder is there
+        check_folder(options.log_folder if folder is None else folder.parent, "--log-folder")
     if options.tensorboard_log:
         check_folder(options.tensorboard_log, "--tensorboard-log")
     model, options, evaluation_env, own_callbacks = prepare(options, config, seed, verbose, cleanup, checkpoint is None)
