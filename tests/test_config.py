@@ -202,6 +202,8 @@ def test_class_names():
         ),
         ("sac", "action_noise", {"OrnsteinUhlenbeckActionNoise": {"sigma": 0.1, "theta": "abc"}}, "theta: 'abc' — expected a"),
         ("sac", "action_noise", 0.1, "action_noise: 0.1 — expected {NameOfTheNoise"),
+        ("ppo", "policy_kwargs.net_arch", {"pi": [8], "v": [8]}, "unknown net_arch key 'v' for .*did you mean 'vf'"),
+        ("td3", "policy_kwargs.net_arch", {"pi": [8], "vf": [8]}, "unknown net_arch key 'vf' for TD3Policy"),
         ("sac", "ent_coef", "foo", "ent_coef: 'foo' — expected a number or auto or auto_<number>"),
         ("tqc", "ent_coef", "auto_foo", "ent_coef: 'auto_foo' — expected"),
         ("sac", "target_entropy", "foo", "target_entropy: 'foo' — expected a number or auto"),

@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, PydanticSchemaGenerationError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_symphony.common.checks import suggestion
@@ -307,6 +308,9 @@ def _policy_kwargs(value: Any, policy_class: type) -> dict[str, Any]:
         raise ConfigError(f"policy_kwargs: {value!r} — expected a mapping")
     types = argument_types(policy_class)
     check_keys(value, types.keys() - _POLICY_RESERVED, "policy_kwargs key", policy_class.__name__)
+    if isinstance(value.get("net_arch"), dict):  # policies leave keys out that they do not know
+        critics = "vf" if issubclass(policy_class, ActorCriticPolicy) else "qf"
+        check_keys(value["net_arch"], {"pi", critics}, "net_arch key", policy_class.__name__)
     decoded = {}
     for key, plain in value.items():
         item = _named_classes(key, plain) if key in _CLASSES and plain is not None else plain
