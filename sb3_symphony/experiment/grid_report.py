@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -187,21 +187,23 @@ def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
     def line(kind: str, run: Run) -> Any:
         return evaluation_curve(run, "steps", "reward") if kind == "evaluations" else episode_curve(run, "steps", "reward", 20)
 
+    def lines(kind: str, row: Sequence["Result"]) -> Iterator[Any]:
+        for each in told_of(row):
+            assert each.run is not None
+            try:
+                x, y = line(kind, each.run)
+            except NotRecorded:
+                continue
+            if len(x):
+                yield x, y
+
     notes = {"evaluations": "mean of each evaluation's episodes", "training": "running mean of 20 training episodes"}
     for kind, smoothed in notes.items():
         panels: dict[str, list[Any]] = {}
         for results in by_environment:
-            lines: dict[str, list[Any]] = {}
-            for each in (each for row in by_algorithm(results).values() for each in told_of(row)):
-                assert each.run is not None
-                try:
-                    x, y = line(kind, each.run)
-                except NotRecorded:
-                    continue
-                if len(x):
-                    lines.setdefault(each.algorithm, []).append((x, y))
-            if lines:
-                panels[results[0].environment] = [summarised(name, seeds) for name, seeds in lines.items()]
+            rows = {name: list(lines(kind, row)) for name, row in by_algorithm(results).items()}
+            if curves := [summarised(name, seeds) for name, seeds in rows.items() if seeds]:
+                panels[results[0].environment] = curves
         output = folder / f"{kind}.png"
         if panels:
             plot_curves(panels, "steps", "reward", smoothed, output)
