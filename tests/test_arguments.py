@@ -362,6 +362,7 @@ LOADED_WRONGLY = [
     dict(tau=7.0),
     dict(batch_size=0),
     dict(action_noise="pink"),
+    dict(stats_window_size=0),
 ]
 
 
@@ -396,6 +397,37 @@ def test_unknown_arguments_of_load(make, algorithm, tmp_path):
     with pytest.raises(TypeError, match=r"load\(\) got an unexpected argument 'gama': did you mean 'gamma'\?"):
         algorithm.load(tmp_path / "model", gama=0.5)
     assert algorithm.load(tmp_path / "model", gamma=0.5, verbose=0).gamma == 0.5
+    for name in ("policy", "args", "kwargs", "support_multi_env"):  # signatures have them, a saved model does not
+        with pytest.raises(TypeError, match=f"unexpected argument {name!r}"):
+            algorithm.load(tmp_path / "model", **{name: "CnnPolicy"})
+
+
+def test_statistics_of_load(make, algorithm, tmp_path):
+    model = make().learn(76)
+    assert len(model.ep_info_buffer) == 3
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", env=model.env, stats_window_size=2)
+    assert list(loaded.ep_info_buffer) == list(model.ep_info_buffer)[1:]
+    assert loaded.learn(60, reset_num_timesteps=False).ep_info_buffer.maxlen == 2
+    assert loaded.learn(30).ep_info_buffer.maxlen == 2
+
+
+def test_sde_of_load(small, tmp_path):
+    for use_sde in (False, True):
+        small(REDQ, use_sde=use_sde).save(tmp_path / "model")
+        with pytest.raises(ValueError, match=f"use_sde={not use_sde}: the saved model has {use_sde}"):
+            REDQ.load(tmp_path / "model", use_sde=not use_sde)
+
+
+def test_policy_kwargs_of_load(make, algorithm, tmp_path):
+    """Those that a model was made with load again, though constructors add to them."""
+    given = dict(net_arch=[8], n_critics=2)
+    make(policy_kwargs=given).save(tmp_path / "model")
+    assert algorithm.load(tmp_path / "model", policy_kwargs=given).policy.net_arch == [8]
+    assert given == dict(net_arch=[8], n_critics=2)
+    assert algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[8])).n_critics == 2
+    with pytest.raises(ValueError, match=r"policy_kwargs has net_arch=\[9\]: the saved model has \[8\]"):
+        algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[9]))
 
 
 def test_entropy_coefficients_of_load(small, tmp_path):
@@ -418,6 +450,20 @@ def test_a_replay_buffer_takes_the_horizon_of_the_model(make, algorithm, tmp_pat
     discounts = loaded.replay_buffer.sample(200).discounts
     assert {0.25} <= set(discounts.flatten().tolist()) <= {0.25, 0.5}  # the last step of an episode has one reward
     assert model.replay_buffer.sample(200).discounts.min().item() == pytest.approx(0.9**3)
+
+
+@pytest.mark.parametrize("truncate", [True, False])
+def test_a_replay_buffer_of_another_episode(make, tmp_path, truncate):
+    """Its n-step returns do not go on with the episode that the model is in."""
+    other = make(n_steps=3, gamma=0.5, gradient_steps=0).learn(30)
+    other.save_replay_buffer(tmp_path / "buffer")
+    model = make(n_steps=3, gamma=0.5, gradient_steps=0, seed=1).learn(30)
+    model.load_replay_buffer(tmp_path / "buffer", truncate_last_traj=truncate)
+    model.learn(10, reset_num_timesteps=False)
+    rewards = model.replay_buffer.rewards[:, 0]
+    last = model.replay_buffer._get_samples(np.array([29]))
+    own = rewards[29] if truncate else rewards[29] + 0.5 * rewards[30] + 0.25 * rewards[31]
+    assert last.rewards.item() == pytest.approx(own) and last.dones.item() == 0
 
 
 def test_a_replay_buffer_without_horizon(small, tmp_path):

@@ -241,6 +241,26 @@ def test_training_may_be_stopped(make, pendulum):
     assert model.num_timesteps == 100
 
 
+@pytest.mark.parametrize("n_steps, last", [(1, 47), (1, 50), (3, 47), (3, 50)])
+def test_learning_after_a_stop(make, n_steps, last):
+    """The step that the callback stopped at is not stored: what follows it is a new episode, not the same one's next step."""
+    model = make(n_steps=n_steps, gamma=0.5, gradient_steps=0)  # episodes of 25 steps
+    model.learn(200, callback=lambda locals_, globals_: model.num_timesteps < last)
+    model.learn(20, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    assert buffer.pos == last - 1 + 20
+    rewards = buffer.rewards[: buffer.pos, 0]
+    before = buffer._get_samples(np.arange(last - 4, last - 1))
+    expected = [
+        sum(0.5**k * reward for k, reward in enumerate(rewards[i : min(i + n_steps, last - 1)]))
+        for i in range(last - 4, last - 1)
+    ]
+    assert before.rewards.flatten().tolist() == pytest.approx(expected)
+    assert before.dones.sum() == 0  # they bootstrap
+    continuous = [np.array_equal(buffer.next_observations[i], buffer.observations[i + 1]) for i in range(25, buffer.pos - 1)]
+    assert continuous == [i != last - 2 for i in range(25, buffer.pos - 1)]
+
+
 def test_progress_bar(make):
     make().learn(40, progress_bar=True)
 

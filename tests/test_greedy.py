@@ -6,11 +6,12 @@ import itertools
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import TransformReward
 from resume_helpers import assert_same_results
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_symphony import REDQ, Symphony
 from sb3_symphony.common.callbacks import GreedyEpisodes
@@ -136,6 +137,15 @@ def test_noise_comes_back_when_it_stalls(scaled, falls, greedy):
     """The mean of two of the environment's rewards is below 0.4 once both are 0."""
     env = RewardScale(Fixed(falls), scale=100.0) if scaled else Fixed(falls)
     callback = GreedyEpisodes(ALWAYS, (3, 9), stall_reward=0.4, stall_steps=2, n_episodes=1)
+    seen = greedy_steps("symphony", env, 4 * LENGTH, callback, learning_starts=1)
+    for k in range(LENGTH, len(seen), LENGTH):
+        assert [each[0] for each in seen[k : k + LENGTH]] == [True] * greedy + [False] * (LENGTH - greedy)
+
+
+@pytest.mark.parametrize("falls, greedy", [(5, 5), (1, 3)])
+def test_rewards_that_are_normalized_do_not_count(falls, greedy):
+    env = VecNormalize(make_vec_env(lambda: TransformReward(Fixed(falls), lambda reward: 100 * reward)), norm_obs=False)
+    callback = GreedyEpisodes(ALWAYS, (3, 9), stall_reward=40, stall_steps=2, n_episodes=1)
     seen = greedy_steps("symphony", env, 4 * LENGTH, callback, learning_starts=1)
     for k in range(LENGTH, len(seen), LENGTH):
         assert [each[0] for each in seen[k : k + LENGTH]] == [True] * greedy + [False] * (LENGTH - greedy)

@@ -331,6 +331,18 @@ def test_numbers_of_updates_that_are_switched_off(pendulum):
     assert model._n_updates == 20
 
 
+@pytest.mark.parametrize("saved", [False, True])
+def test_episodes_without_updates_are_not_made_up_for(pendulum, tmp_path, saved):
+    model = short_model(pendulum(1, 10), gradient_steps=0).learn(55)
+    if saved:
+        model.save(tmp_path / "model")
+        model = Symphony.load(tmp_path / "model", env=model.env, device="cpu", gradient_steps=3)
+    else:
+        model.gradient_steps = 3
+    model.learn(1, reset_num_timesteps=False)
+    assert model._n_updates == 128 + 3
+
+
 def test_weights_are_redrawn_at_the_start_of_warm_up_episodes(pendulum):
     model = short_model(pendulum(1, 10), learning_starts=35)
     start = {name: value.clone() for name, value in model.actor.named_parameters()}
@@ -366,6 +378,31 @@ def test_no_redraw_of_an_actor_that_another_model_has_trained(pendulum):
     model.learn(35)
     assert model._n_updates == 0
     assert all(th.equal(value, trained.actor.state_dict()[name]) for name, value in model.actor.state_dict().items())
+
+
+@pytest.mark.parametrize("by", ["imitation", "state"])
+def test_no_redraw_of_weights_that_were_put_in(pendulum, by):
+    """There is nothing of them in Symphony's optimizer."""
+    model = short_model(pendulum(1, 10), learning_starts=35)
+    if by == "imitation":
+        optimizer = th.optim.SGD(model.actor.parameters(), lr=0.1)
+        model.actor(th.ones(1, 3)).sum().backward()
+        optimizer.step()
+    else:
+        model.policy.load_state_dict(short_model(pendulum(1, 10), seed=1).policy.state_dict())
+    start = copy.deepcopy(model.actor.state_dict())
+    model.learn(35)
+    assert all(th.equal(value, start[name]) for name, value in model.actor.state_dict().items())
+
+
+@pytest.mark.parametrize("steps", [0, 5, 10])
+def test_a_saved_actor_that_was_drawn_is_drawn_again(pendulum, tmp_path, steps):
+    model = short_model(pendulum(1, 10), learning_starts=35).learn(steps)
+    model.save(tmp_path / "model")
+    loaded = Symphony.load(tmp_path / "model", env=model.env, device="cpu")
+    th.manual_seed(1)  # loading seeds like making a model: the next weights would be those drawn first
+    loaded.learn(11, reset_num_timesteps=False)
+    assert not th.equal(loaded.actor.mu[0].weight, model.actor.mu[0].weight)
 
 
 def test_who_is_evaluated_during_the_warm_up_is_who_acts(pendulum):

@@ -248,7 +248,9 @@ class GreedyEpisodes(_OnReturn):
 
     def _on_step(self) -> bool:
         model: Any = self.model
-        steps = zip(self.locals["rewards"], self.locals["dones"], self.locals["infos"], strict=True)
+        normalized = model.get_vec_normalize_env()
+        rewards = self.locals["rewards"] if normalized is None else normalized.get_original_reward()
+        steps = zip(rewards, self.locals["dones"], self.locals["infos"], strict=True)
         for i, (reward, done, info) in enumerate(steps):
             self.rewards[i].append(float(info.get("raw_reward", reward)))
             if done:

@@ -111,7 +111,7 @@ class DecayingNormalActionNoise(DecayingActionNoise):
     Independent Gaussian noise, clipped at a multiple of σ_t, with decaying σ_t.
 
     The defaults are Symphony's: σ_t = 0.15·(1 + cos(πt/T)) until T = 104 720 steps, then 0, clipped at ±2.5σ_t
-    (which lowers the standard deviation by 2 %). Source: Read, "Dancing like the Inbetweeners: learning to walk with
+    (which lowers the standard deviation by 1 %). Source: Read, "Dancing like the Inbetweeners: learning to walk with
     Symphony" (2024), with the numbers of the original author's code.
 
     :param n_actions: number of action dimensions, or the action space's shape

@@ -5,6 +5,7 @@ import io
 import math
 import pathlib
 import warnings
+from collections import deque
 from collections.abc import Iterator
 from typing import Any, ClassVar, TypeVar
 
@@ -16,7 +17,7 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, RolloutReturn, TrainFreq
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import (
@@ -34,6 +35,7 @@ from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
+NOT_LOADED = {"policy", "args", "kwargs", "supported_action_spaces", "support_multi_env", "sde_support", "_init_setup_model"}
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
@@ -142,12 +144,15 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         check_number("n_steps", self.n_steps, 1, integer=True)
         check_number("n_critics", self.n_critics, 1, integer=True)
         check_number("policy_delay", self.policy_delay, 1, integer=True)
+        check_number("stats_window_size", self._stats_window_size, 1, integer=True)
         check_choice("target_mode", self.target_mode, TARGET_MODES)
         check_choice("critic_loss", self.critic_loss, (*CRITIC_LOSSES, CLASSIFICATION))
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
         self._check_classification()
-        if self.n_critics != self.policy_kwargs["n_critics"]:
-            raise ValueError(f"n_critics={self.n_critics!r}: the saved model has {self.policy_kwargs['n_critics']!r}")
+        for name in ("n_critics", "use_sde"):
+            built = self.policy_kwargs.get(name, False)
+            if getattr(self, name) != built:
+                raise ValueError(f"{name}={getattr(self, name)!r}: the saved model has {built!r}")
         if self.action_noise is not None and not isinstance(self.action_noise, ActionNoise):
             raise TypeError(f"action_noise={self.action_noise!r}: expected an ActionNoise or None")
         self._check_noise_shape()
@@ -241,6 +246,13 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         return result
 
     # ---------------------------------------------------------------- training
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        rollout = super().collect_rollouts(*args, **kwargs)
+        if not rollout.continue_training:
+            # The environments are a step ahead of the latest observation, maybe in another episode: the next learn() resets
+            self._last_obs = None
+        return rollout
 
     def _segments(
         self, gradient_steps: int, batch_size: int, **sample_kwargs: Any
@@ -353,25 +365,39 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         """
         SB3's, except that it does not take any keyword for an attribute.
 
-        :param kwargs: Arguments of the constructor, in place of the saved ones
+        :param kwargs: Arguments of the constructor, in place of the saved ones. What ``policy_kwargs`` names has to be what
+            the saved model has
         :raises TypeError: for another keyword
         :raises ValueError: if an argument is out of range or does not fit the saved model
         """
-        known = {name for base in cls.__mro__ for name in inspect.signature(base).parameters}
+        known = {name for base in cls.__mro__ for name in inspect.signature(base).parameters} - NOT_LOADED
         for name in kwargs:
             if name not in known:
                 raise TypeError(f"load() got an unexpected argument {name!r}{suggestion(name, known)}")
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        policy_kwargs = kwargs.pop("policy_kwargs", None) or {}  # SB3 compares them with those that a constructor completed
+        if "stats_window_size" in kwargs:
+            kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
+        model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        for name, value in policy_kwargs.items():
+            saved = model.policy_kwargs.get(name)
+            if value != saved:
+                raise ValueError(f"policy_kwargs has {name}={value!r}: the saved model has {saved!r}")
+        if "_stats_window_size" in kwargs:
+            model.ep_info_buffer = deque(model.ep_info_buffer or (), model._stats_window_size)
+            model.ep_success_buffer = deque(model.ep_success_buffer or (), model._stats_window_size)
+        return model
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
         SB3's; the horizon of the buffer's returns and their discount become the model's.
 
+        :param truncate_last_traj: Whether the buffer's last episode ends there; else it is the one that the model is in
         :raises ValueError: if the model needs n-step returns and the buffer has none; the model's own buffer then stays
         """
         before = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
         loaded = self.replay_buffer
+        assert loaded is not None
         if isinstance(loaded, NStepReplayBuffer):
             loaded.n_steps, loaded.gamma = self.n_steps, self.gamma
         elif self.n_steps > 1:
@@ -379,6 +405,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             raise ValueError(
                 f"n_steps={self.n_steps}: the saved {type(loaded).__name__} has no n-step returns, expected n_steps=1"
             )
+        if truncate_last_traj and not isinstance(loaded, HerReplayBuffer):  # for HER, SB3 does it
+            end_trajectory(loaded)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression"]

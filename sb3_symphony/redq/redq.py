@@ -290,6 +290,9 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             progress_bar=progress_bar,
         )
 
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "ent_coef_tensor"]  # which belongs to a device; made again from ent_coef
+
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
         if self.ent_coef_optimizer is None:  # fixed: it is an argument, which may be replaced when loading

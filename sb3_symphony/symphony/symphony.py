@@ -1,3 +1,4 @@
+import zlib
 from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
@@ -8,6 +9,7 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from torch import nn
 from torch.nn import functional as F
 
 from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
@@ -72,8 +74,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
     :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
     :param episode_gradient_steps: Additional updates at the start of each episode
-    :param warmup_policy: Who acts before learning starts: ``"actor"``, with weights drawn anew for each episode, or
-        ``"uniform"`` random actions
+    :param warmup_policy: Who acts before learning starts: ``"actor"``, with weights drawn anew for each episode as long as
+        they are not trained or given, or ``"uniform"`` random actions
     :param stats_window_size: Number of episodes to average the reported success rate, length and reward over
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Arguments of the policy, see :class:`~sb3_symphony.symphony.policies.SymphonyPolicy`
@@ -169,6 +171,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self.episode_gradient_steps = episode_gradient_steps
         self.warmup_policy = warmup_policy
         self._redraw_actor = True  # an episode begins
+        self._drawn_weights: int | None = None  # the actor's, as they were drawn last; in a saved model, too
         self._new_episodes = 0  # begun since the last update
 
         if _init_setup_model:
@@ -194,6 +197,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             check_choice("action_noise", self.action_noise, ("default",))
             self.action_noise = DecayingNormalActionNoise(self.action_space.shape)
         super()._setup_model()
+        if self._drawn_weights is None:
+            self._drawn_weights = self._actor_weights()
         self._set_mixes()
         # Mean value at the previous update, which the actor's loss compares with
         self.baseline = th.zeros((), device=self.device)
@@ -272,20 +277,25 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         if self.warmup_policy == "actor" and self.num_timesteps < learning_starts:
-            # Never a trained one, when learn() starts counting anew or its weights are another model's
-            if self._redraw_actor and self._n_updates == 0 and not self.actor.optimizer.state:
+            # Never one that was trained, here or elsewhere: its weights are no longer those that were drawn
+            if self._redraw_actor and self._actor_weights() == self._drawn_weights:
                 self.actor.redraw()
+                self._drawn_weights = self._actor_weights()
                 self.policy.restart_average()
                 self._redraw_actor = False
             learning_starts = 0  # the actor acts, with noise
         return super()._sample_action(learning_starts, action_noise, n_envs)
+
+    def _actor_weights(self) -> int:
+        """Checksum, the same on every device."""
+        return zlib.crc32(nn.utils.parameters_to_vector(self.actor.mu.parameters()).detach().cpu().numpy().tobytes())
 
     def _store_transition(self, replay_buffer: ReplayBuffer, buffer_action: np.ndarray, *args: Any) -> None:
         super()._store_transition(replay_buffer, buffer_action, *args)
         dones = args[2]
         if dones.any():
             self._redraw_actor = True
-            if self.num_timesteps > self.learning_starts:
+            if self.num_timesteps > self.learning_starts and self.gradient_steps != 0:
                 self._new_episodes += int(dones.sum())
 
     def learn(
