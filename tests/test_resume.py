@@ -635,6 +635,20 @@ def test_environment_that_cannot_be_replayed(killed, capsys):
     assert sum(int(row.split(",")[1]) for row in rows[1:]) <= 260
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signals_to_the_group(folder, number):
+    """As `timeout` and Ctrl-C send them: to the run and, unless it has none there, to its environments' processes."""
+    arguments = "train --algo sac --env Pendulum-v1 -n 1000000 --vec-env subproc --save-freq 100000 --verbose 0".split()
+    process, _ = start(*arguments, "--no-progress", "-params", "n_envs:2", "learning_starts:1000000", start_new_session=True)
+    time.sleep(1)
+    os.killpg(process.pid, number)
+    output = process.communicate(timeout=60)[0]
+    assert process.returncode == 130 and "Traceback" not in output, output
+    run = folder / "logs" / "sac" / "Pendulum-v1_1"
+    model = load_algorithm("sac").load(run / "Pendulum-v1.zip")
+    assert newest_checkpoint(run / "checkpoints").steps == model.num_timesteps > 0
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # kill -9
 # ----------------------------------------------------------------------------------------------------------------------
@@ -647,10 +661,10 @@ KILLED_RUNS = {
 KILLED_PARAMS = "learning_starts:60 buffer_size:400 batch_size:32 gradient_steps:3 policy_kwargs.net_arch:[16]".split()
 
 
-def start(*arguments):
+def start(*arguments, **kwargs):
     """Start a process and wait until it begins to learn (or says that it need not); returns it and the time."""
     command = [sys.executable, "-m", "sb3_symphony", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **kwargs)
     line = process.stdout.readline()
     assert "steps into" in line or "is finished" in line, line + process.stdout.read()
     return process, time.monotonic()

@@ -1,5 +1,6 @@
 """Environments of a run: what is learned from, and what is evaluated."""
 
+import os
 import signal
 import time
 import warnings
@@ -332,7 +333,10 @@ class RunMonitor(Monitor):
 
 
 def _in_own_process(make: Callable[[], gym.Env], packages: list[str]) -> gym.Env:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the run decides
+    # Ctrl-C and `timeout` reach all processes of a group; the run decides, which needs its environments until then
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "setpgrp"):
+        os.setpgrp()
     import_packages(packages)  # what is registered is registered in one process
     return make()
 
