@@ -216,6 +216,33 @@ def test_class_names():
         ("sac", "n_timesteps", "many", "n_timesteps: 'many' — expected a whole number"),
         ("sac", "env_wrapper", 3, "expected a dotted name"),
         ("sac", "noise_type", "normal", "expected both or neither"),
+        (
+            "td3",
+            "policy_kwargs.optimizer_kwargs",
+            {"weight_dekay": 1},
+            "optimizer_kwargs key 'weight_dekay' for Adam: did you",
+        ),
+        ("td3", "policy_kwargs.optimizer_kwargs", {"lr": 1}, "unknown optimizer_kwargs key 'lr' for Adam"),
+        (
+            "symphony",
+            "policy_kwargs",
+            {"optimizer_class": "SGD", "optimizer_kwargs": {"betas": [0, 0]}},
+            "unknown optimizer_kwargs key 'betas' for SGD",
+        ),
+        (
+            "redq",
+            "policy_kwargs.features_extractor_kwargs",
+            {"dim": 3},
+            "features_extractor_kwargs key 'dim' for FlattenExtractor",
+        ),
+        (
+            "ppo",
+            "policy_kwargs",
+            {"features_extractor_class": "NatureCNN", "features_extractor_kwargs": {"feature_dim": 3}},
+            "for NatureCNN: did you mean 'features_dim'",
+        ),
+        ("td3", "replay_buffer_kwargs.handle_timeout_terminaton", False, "did you mean 'handle_timeout_termination'"),
+        ("sac", "replay_buffer_kwargs.buffer_size", 3, "unknown replay_buffer_kwargs key 'buffer_size'"),
         ("td3", "noise_type", "pink", "noise_type: 'pink' — expected 'normal' or 'ornstein-uhlenbeck'"),
     ],
 )
@@ -226,8 +253,15 @@ def test_wrong_values(algo, key, value, message):
 
 
 def test_noise_type_for_an_algorithm_without_noise():
-    with pytest.raises(ConfigError, match="ppo takes no noise_type"):
+    with pytest.raises(ConfigError, match="noise_type: 'normal' — ppo takes no action noise"):
         decode("ppo", noise_type="normal", noise_std=0.1)
+
+
+def test_two_noises():
+    with pytest.raises(
+        ConfigError, match="action_noise: beside it the configuration has noise_type 'normal' — expected noise"
+    ):
+        decode("td3", noise_type="normal", noise_std=0.1, action_noise={"PinkActionNoise": {"sigma": 0.3}})
 
 
 def test_wrappers():

@@ -480,6 +480,15 @@ def test_a_worker_of_loky_that_dies_is_replaced(folder, die_once):
         ({"device": "tpu"}, "'tpu'"),
         ({"matrix": {"label": "g", "conditions": {1: {"env_kwargs": {"gg": 1}}}}}, "condition '1': environment 'Pendulum-v1'"),
         ({"matrix": {"label": "w", "conditions": {"a": {"env_wrapper": "gymnasium.wrappers.TimeLimt"}}}}, "did you mean"),
+        (
+            {
+                "matrix": {
+                    "label": "n",
+                    "conditions": {2: {"env_wrapper": {"gymnasium.wrappers.FrameStackObservation": {"stack_size": 2}}}},
+                }
+            },
+            "td3 on Pendulum-v1: condition '2': the model does not fit Pendulum-v1: observation space of the model",
+        ),
         ({"sead": 3}, "unknown option 'sead': did you mean 'seeds'?"),
     ],
 )

@@ -619,6 +619,28 @@ def test_resume_that_is_interrupted_before_it_begins(killed, monkeypatch):
     assert_same_results(whole, run)
 
 
+def test_a_configuration_that_was_changed(killed):
+    whole = train(options(log_folder="a")).run.path
+    run = killed(230, options(log_folder="b"))
+    config = run / "Pendulum-v1" / "config.yml"
+    before = config.read_text()
+    config.write_text(yaml.safe_dump({**yaml.safe_load(before), "policy_kwargs": {"net_arch": [9]}}))
+    with pytest.raises(
+        ConfigError, match=r"config\.yml was changed: the checkpoint at 200 steps is of another model — .*size mismatch"
+    ):
+        resume(run)
+    config.write_text(before)
+    resume(run)
+    assert_same_results(whole, run)
+
+
+def test_a_command_in_another_encoding(killed):
+    run = killed(230, options())
+    (run / "Pendulum-v1" / "command.txt").write_bytes("träin\n".encode("latin-1"))
+    assert resume(run).steps == 260
+    assert (run / "Pendulum-v1" / "command.txt").read_text(encoding="utf-8").startswith("tr\ufffdin\n")
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Environments whose state cannot be made again
 # ----------------------------------------------------------------------------------------------------------------------

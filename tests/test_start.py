@@ -566,24 +566,44 @@ def test_a_disk_that_is_full_from_the_beginning(monkeypatch):
         train(options())
 
 
-@pytest.mark.skipif(
+def as_an_ordinary_user(folder, *argv):
+    """Root may write everywhere, so if the tests run as root, the command runs without that right; returns its error."""
+    command = [sys.executable, "-W", "ignore", "-m", "sb3_symphony", *argv]
+    if os.geteuid() == 0:
+        rights = "-dac_override,-dac_read_search"
+        command = ["setpriv", f"--bounding-set={rights}", f"--inh-caps={rights}", *command]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    errors = [line for line in done.stderr.splitlines() if "error: " in line]
+    assert done.returncode == 2 and len(errors) == 1 and "Traceback" not in done.stderr, done.stderr
+    return errors[0]
+
+
+needs_rights = pytest.mark.skipif(
     os.name != "posix" or (os.geteuid() == 0 and shutil.which("setpriv") is None), reason="needs POSIX rights, that hold"
 )
+
+
+@needs_rights
 @pytest.mark.parametrize("flag", ["-f", "-tb"])
 def test_unwritable_folder_as_an_ordinary_user(tmp_path_factory, flag):
-    """Root may write everywhere, so if the tests run as root, the command runs without that right."""
     folder = tmp_path_factory.mktemp("shared")
     locked = folder / "locked"
     locked.mkdir(mode=0o555)
     (locked / "mine").write_text("mine")
     small = ["-n", "60", "-params", "buffer_size:100", "policy_kwargs.net_arch:[8]"]
     argv = ["train", "--algo", "td3", "--env", "Pendulum-v1", *small, "--device", "cpu", flag, str(locked / "logs")]
-    command = [sys.executable, "-W", "ignore", "-m", "sb3_symphony", *argv]
-    if os.geteuid() == 0:
-        rights = "-dac_override,-dac_read_search"
-        command = ["setpriv", f"--bounding-set={rights}", f"--inh-caps={rights}", *command]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=locked)
-    errors = [line for line in done.stderr.splitlines() if "error: " in line]
-    assert done.returncode == 2 and len(errors) == 1 and "Traceback" not in done.stderr, done.stderr
-    assert "cannot be written — Permission denied" in errors[0]
+    assert "cannot be written — Permission denied" in as_an_ordinary_user(locked, *argv)
     assert [path.name for path in locked.iterdir()] == ["mine"]
+
+
+@needs_rights
+def test_a_run_that_may_only_be_read(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shared")
+    small = {"buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
+    run = train(options(log_folder=str(folder), n_timesteps=60, save_freq=40, hyperparams=small)).run.path
+    there = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    run.chmod(0o555)
+    (run / "checkpoints").chmod(0o555)
+    message = as_an_ordinary_user(folder, "train", "--resume", str(run), "-n", "100")
+    assert f"--resume: '{run}' cannot be written — Permission denied" in message
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == there

@@ -247,6 +247,18 @@ def test_algorithms_of_a_file(write, tmp_path):
         ({"figures": {"training": {}}}, "figures: 'training' — expected letters"),
         ({"figures": {"x": {"algorithms": ["td4"]}}}, "figures: x: algorithms: unknown name 'td4': did you mean 'td3'?"),
         ({"figures": {"x": {"x_axis": "days"}}}, "x_axis: 'days'"),
+        ({"figures": {"x": {"json_file": "a.json"}}}, "figures: 'json_file' — is for the command line"),
+        ({"figures": {"x": {"mean_per": 10, "evaluations": True}}}, "figures: --mean-per: 10 — is for training episodes"),
+        (
+            {
+                "algorithms": [
+                    "td3",
+                    {"name": "b", "algo": "ddpg", "start_from": {"algorithm": "td3", "environment": WALKER}},
+                ]
+            },
+            "b: start_from: td3 is of algorithm 'td3' — expected 'ddpg'",
+        ),
+        ({"final_episodes": True}, "final_episodes: True — expected a whole number"),
     ],
 )
 def test_mistakes_of_what_goes_beyond_a_grid(write, changes, message):

@@ -163,6 +163,10 @@ def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
+class DoesNotFit(ValueError):
+    """A checkpoint is of another model than the one that is to go on from it."""
+
+
 @dataclass
 class Checkpoint:
     """
@@ -270,7 +274,11 @@ class ExactCheckpoints(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if self._restoring is not None:
-            self._restore(self._restoring)
+            try:
+                self._restore(self._restoring)
+            except (RuntimeError, ValueError, KeyError) as error:  # PyTorch's, NumPy's
+                what = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
+                raise DoesNotFit(f"the checkpoint at {self._restoring.steps} steps is of another model — {what}") from error
             self._restoring = None
         elif self.wanted() or self.model.num_timesteps // self.save_freq > self._latest // self.save_freq:
             self.save()

@@ -272,11 +272,22 @@ def _fits(model: spaces.Space, env: spaces.Space, exact: bool) -> bool:
 
 def check_match(model: BaseAlgorithm, env: VecEnv, selection: Selection) -> None:
     """
-    Limits of observations are not compared: they differ between versions of an environment, and nothing uses them.
-
     :param model: a trained model
     :param env: environment that it is to act in
     :param selection: where both come from
+    :raises ConfigError: if their spaces differ
+    """
+    check_spaces(model, env, str(selection.model), selection.env_id)
+
+
+def check_spaces(model: BaseAlgorithm, env: VecEnv, name: str, env_id: str) -> None:
+    """
+    Limits of observations are not compared: they differ between versions of an environment, and nothing uses them.
+
+    :param model: a model
+    :param env: environment that it is to act in
+    :param name: what the model is called in the message
+    :param env_id: the environment's id
     :raises ConfigError: if their spaces differ
     """
     for what, own, given, exact in (
@@ -285,4 +296,4 @@ def check_match(model: BaseAlgorithm, env: VecEnv, selection: Selection) -> None
     ):
         if not _fits(own, given, exact):
             both = f"{what} space of the model {own}, of the environment {given}"
-            raise ConfigError(f"{selection.model} does not fit {selection.env_id}: {both}")
+            raise ConfigError(f"{name} does not fit {env_id}: {both}")

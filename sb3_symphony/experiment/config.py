@@ -281,6 +281,8 @@ def _no_boolean(value: Any) -> Any:
 
 #: a whole number from 1 on
 Count = Annotated[int, BeforeValidator(_no_boolean), Field(ge=1)]
+#: a whole number from 0 on
+Whole = Annotated[int, BeforeValidator(_no_boolean), Field(ge=0)]
 
 
 class RunSettings(BaseModel):

@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 from pydantic import AfterValidator, ConfigDict, PydanticSchemaGenerationError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -31,6 +32,7 @@ _BUFFERS: dict[str, tuple[str, ...]] = {
     "stable_baselines3.her.her_replay_buffer": ("HerReplayBuffer",),
     f"{_OURS}.buffers": ("FadingReplayBuffer", "FadingDictReplayBuffer", "PrioritizedReplayBuffer"),
 }
+_SB3_BUFFERS = (DictReplayBuffer, NStepReplayBuffer, ReplayBuffer)  # of which SB3 takes one by itself
 _EXTRACTORS: dict[str, tuple[str, ...]] = {f"{_SB3}.torch_layers": ("FlattenExtractor", "NatureCNN", "CombinedExtractor")}
 #: key → module → classes that it may name
 _CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -59,8 +61,12 @@ _CLASSES: dict[str, dict[str, tuple[str, ...]]] = {
 
 #: set by the command line
 RESERVED = {"self", "env", "policy", "verbose", "seed", "device", "tensorboard_log", "_init_setup_model"}
-#: given by the algorithm to its policy
+#: given by the algorithm to its replay buffer, and to its policy
+_BUFFER_RESERVED = {"self", "buffer_size", "observation_space", "action_space", "device", "n_envs", "optimize_memory_usage"}
 _POLICY_RESERVED = {"self", "observation_space", "action_space", "lr_schedule", "use_sde"}
+
+#: classes that a policy makes, and the arguments that it gives them
+_PARTS = {"optimizer": {"self", "params", "lr"}, "features_extractor": {"self", "observation_space"}}
 
 _AT_LEAST_ONE = {
     "batch_size",
@@ -315,6 +321,14 @@ def _policy_kwargs(value: Any, policy_class: type) -> dict[str, Any]:
     for key, plain in value.items():
         item = _named_classes(key, plain) if key in _CLASSES and plain is not None else plain
         decoded[key] = _typed(key, plain, item, types[key], -math.inf)
+    for part, filled in _PARTS.items():
+        signatures = (inspect.signature(parent).parameters for parent in policy_class.__mro__)
+        default = next((known[f"{part}_class"].default for known in signatures if f"{part}_class" in known), None)
+        class_ = decoded.get(f"{part}_class") or default or getattr(policy_class, "default_features_extractor", None)
+        if class_ is not None and decoded.get(f"{part}_kwargs"):
+            check_keys(
+                decoded[f"{part}_kwargs"], argument_types(class_).keys() - filled, f"{part}_kwargs key", class_.__name__
+            )
     return decoded
 
 
@@ -336,9 +350,9 @@ def _check_replay(name: str, algorithm: Any, decoded: Mapping[str, Any]) -> None
     chosen, arguments = decoded.get("replay_buffer_class"), decoded.get("replay_buffer_kwargs")
     if getattr(chosen, "__name__", "") == "PrioritizedReplayBuffer" and not _is_ours(algorithm):
         raise ConfigError(f"replay_buffer_class: 'PrioritizedReplayBuffer' — {name} does not apply its importance weights")
-    classes = [chosen] if chosen is not None else algorithm.default_buffers if _is_ours(algorithm) else []
-    if arguments and classes:
-        known = {key for class_ in classes for key in argument_types(class_)}
+    classes = [chosen] if chosen is not None else getattr(algorithm, "default_buffers", _SB3_BUFFERS)
+    if arguments:
+        known = {key for class_ in classes for key in argument_types(class_)} - _BUFFER_RESERVED
         owner = " or ".join(dict.fromkeys(class_.__name__ for class_ in classes))
         check_keys(arguments, known, "replay_buffer_kwargs key", owner)
 
@@ -378,8 +392,13 @@ def algorithm_arguments(
     n_actions = shape[0] if len(shape) == 1 else shape
     plain_arguments = dict(config.arguments)
     if settings.noise_type is not None:
-        if "action_noise" not in known or "action_noise" in plain_arguments:
-            raise ConfigError(f"noise_type: {settings.noise_type!r} — {name} takes no noise_type beside its own noise")
+        if "action_noise" not in known:
+            raise ConfigError(f"noise_type: {settings.noise_type!r} — {name} takes no action noise")
+        if "action_noise" in plain_arguments:
+            raise ConfigError(
+                f"action_noise: beside it the configuration has noise_type {settings.noise_type!r} — "
+                "expected noise_type: null and noise_std: null then"
+            )
         noise = {"normal": "NormalActionNoise", "ornstein-uhlenbeck": "OrnsteinUhlenbeckActionNoise"}[settings.noise_type]
         plain_arguments["action_noise"] = {noise: {"sigma": settings.noise_std}}
 

@@ -36,6 +36,8 @@ from sb3_symphony.experiment.signals import handled_by
 from sb3_symphony.experiment.study import Cell, Study, found_by, read_study, sweep_options
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
     from sb3_symphony.experiment.backends import Backend
 
 #: seconds between two signs of life for the cells
@@ -150,17 +152,20 @@ def _check_models(progress: Sequence[Progress]) -> None:
             env.close()
             keep_protocol(cell.options, each.config)
             for name, condition in cell.conditions.items():
-                _check_condition(name, condition, cell, each.config)
+                _check_condition(name, condition, cell, each.config, model)
         except ConfigError as error:
             raise ConfigError(f"{cell.algorithm} on {cell.environment.id}: {error}") from None
 
 
-def _check_condition(name: str, condition: dict[str, Any], cell: Cell, config: RunConfig) -> None:
+def _check_condition(name: str, condition: dict[str, Any], cell: Cell, config: RunConfig, model: "BaseAlgorithm") -> None:
+    from sb3_symphony.experiment.agent import check_spaces
     from sb3_symphony.experiment.environment import make_evaluation_env
 
     settings = config.settings.varied(condition["env_kwargs"], condition["env_wrapper"])
     try:
-        make_evaluation_env(cell.environment.id, settings).close()
+        env = make_evaluation_env(cell.environment.id, settings)
+        env.close()
+        check_spaces(model, env, "the model", cell.environment.id)
     except ConfigError as error:
         raise ConfigError(f"condition '{name}': {error}") from None
 

@@ -55,7 +55,7 @@ def plot(options: PlotOptions, groups: "list[Group] | None" = None) -> Path:
     """
     from sb3_symphony.analysis import plots, style
 
-    _check(options)
+    check_options(options)
     with report(options.json_file) as tell:
         try:
             groups = _groups(options) if groups is None else groups
@@ -79,7 +79,11 @@ def plot(options: PlotOptions, groups: "list[Group] | None" = None) -> Path:
     return output
 
 
-def _check(options: PlotOptions) -> None:
+def check_options(options: PlotOptions) -> None:
+    """
+    :param options: options of the command line, or of a figure of a study
+    :raises ConfigError: if they contradict each other
+    """
     if options.evaluations and options.kind == "scalars":
         raise ConfigError("--evaluations and --scalars: expected only one of them")
     if options.mean_per is not None and options.kind != "episodes":

@@ -104,7 +104,7 @@ class RunFolder:
     def command(self) -> str:
         """The command lines the run was started and resumed with."""
         path = self.details / "command.txt"
-        return path.read_text(encoding="utf-8").strip() if path.is_file() else ""
+        return path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""
 
     def growing_files(self) -> list[Path]:
         """:return: files that get longer while training, as far as they are there"""

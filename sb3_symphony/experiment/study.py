@@ -23,6 +23,7 @@ from sb3_symphony.experiment.config import (
     NamedList,
     RunConfig,
     TrainOptions,
+    Whole,
     check_algorithm,
     load_config,
     of_networks,
@@ -30,7 +31,7 @@ from sb3_symphony.experiment.config import (
     shipped_file,
     validated,
 )
-from sb3_symphony.experiment.plot import PlotOptions
+from sb3_symphony.experiment.plot import PlotOptions, check_options
 from sb3_symphony.experiment.registry import is_file
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.space import TuneOptions, read_space
@@ -162,7 +163,7 @@ class Protocol(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    eval_freq: int = Field(default=10_000, ge=0)
+    eval_freq: Whole = 10_000
     eval_episodes: Count = 10
 
 
@@ -192,7 +193,7 @@ class Condition(BaseModel):
     env_kwargs: dict[str, Any] = {}
     env_wrapper: NamedList = []
     obs_noise: FiniteFloat = Field(default=0.0, ge=0)
-    action_delay: int = Field(default=0, ge=0)
+    action_delay: Whole = 0
 
 
 def _conditions(value: Any) -> Any:
@@ -233,7 +234,7 @@ class Quick(BaseModel):
     seeds: _Seeds | None = None
     steps: Count | None = None
     protocol: _AnyProtocol | None = None
-    final_episodes: int | None = Field(default=None, ge=0)
+    final_episodes: Whole | None = None
     save_freq: Count | None = None
     overrides: dict[str, Any] = {}
     sweeps: dict[str, Any] = {}
@@ -256,6 +257,10 @@ def _sweep(options: Any) -> TuneOptions:
     return _part(TuneOptions, "algo", options)
 
 
+#: options of ``plot`` that a study does not settle
+_NOT_OF_FIGURES = ("runs", "algo", "env", "folder", "labels", "output", "json_file")
+
+
 def _figures(value: Any) -> Any:
     if not isinstance(value, dict):
         raise ValueError("expected a mapping of file names to options of plot, such as {reward: {x_axis: episodes}}")
@@ -264,7 +269,16 @@ def _figures(value: Any) -> Any:
             raise ConfigError(
                 f"'{name}' — expected letters, digits and _ -, and not the name of a figure that all studies have"
             )
-    return {str(name): _part(Drawing, None, figure) for name, figure in value.items()}
+    return {str(name): _figure(figure) for name, figure in value.items()}
+
+
+def _figure(options: Any) -> "Drawing":
+    for name in _NOT_OF_FIGURES:
+        if isinstance(options, dict) and name in options:
+            raise ConfigError(f"'{name}' — is for the command line; a figure has algorithms and environments of the study")
+    drawing: Drawing = _part(Drawing, None, options)
+    check_options(drawing)
+    return drawing
 
 
 class Drawing(PlotOptions):
@@ -314,7 +328,7 @@ class Study(BaseModel):
     seeds: _Seeds
     steps: Count | None = None
     protocol: _AnyProtocol = "standard"
-    final_episodes: int = Field(default=100, ge=0)
+    final_episodes: Whole = 100
     save_freq: Count = 10_000
     device: str = "cpu"
     matrix: Annotated[Matrix | None, BeforeValidator(partial(_part, Matrix, None))] = None
@@ -408,6 +422,10 @@ def _check(study: Study, folder: Path) -> None:
             if source.start_from is not None:
                 raise ConfigError(f"{where}: {source.name} starts from another one itself — expected one that does not")
             _chosen(where, [each.start_from.environment], _environments(study, source))
+            if _algo(source, folder) != _algo(each, folder):
+                raise ConfigError(
+                    f"{where}: {source.name} is of algorithm '{_algo(source, folder)}' — expected '{_algo(each, folder)}'"
+                )
             missing = set(each.seeds or study.seeds) - set(source.seeds or study.seeds)
             if missing:
                 raise ConfigError(f"{where}: {source.name} has no seed {min(missing)}")

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.analysis.plots import plot_training
-from sb3_symphony.common.checkpoint import Checkpoint, ExactCheckpoints, platform_of
+from sb3_symphony.common.checkpoint import Checkpoint, DoesNotFit, ExactCheckpoints, platform_of
 from sb3_symphony.experiment.agent import check_device
 from sb3_symphony.experiment.callbacks import (
     NoteLogFolder,
@@ -336,7 +336,10 @@ def train(options: TrainOptions, command: str | None = None, folder: Path | None
         for written in (stored.run.path, stored.run.checkpoints):
             check_folder(written, "--resume")
         cleanup.enter_context(_alone(stored.run))
-        return _train(stored.options, stored.config, command, cleanup, stored.run, stored.checkpoint())
+        try:
+            return _train(stored.options, stored.config, command, cleanup, stored.run, stored.checkpoint())
+        except DoesNotFit as error:
+            raise ConfigError(f"--resume: {stored.run.details / 'config.yml'} was changed: {error}") from None
 
 
 def _train(
