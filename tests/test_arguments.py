@@ -356,7 +356,6 @@ def test_policies_of_sb3(algorithm, policy):
 LOADED_WRONGLY = [
     dict(n_critics=7),
     dict(target_mode="man"),
-    dict(critic_reduction="ensemble"),
     dict(policy_delay=0),
     dict(critic_loss="msee"),
     dict(tau=7.0),
@@ -381,6 +380,13 @@ def test_own_arguments_of_load(small, tmp_path):
     small(Symphony).save(tmp_path / "symphony")
     with pytest.raises(ValueError, match="did you mean 'rehae'"):
         Symphony.load(tmp_path / "symphony", actor_loss="rehaee")
+    with pytest.raises(ValueError, match="critic_reduction='ensemble'"):
+        REDQ.load(tmp_path / "redq", critic_reduction="ensemble")
+    for name in ("critic_reduction", "use_sde"):  # its base classes have them
+        with pytest.raises(TypeError, match=f"unexpected argument '{name}'"):
+            Symphony.load(tmp_path / "symphony", **{name: "independent"})
+    with pytest.raises(ValueError, match="target_entropy='mbpo': expected an env"):
+        REDQ.load(tmp_path / "redq", target_entropy="mbpo")
 
 
 def test_models_of_another_algorithm(small, tmp_path):
@@ -425,7 +431,7 @@ def test_policy_kwargs_of_load(make, algorithm, tmp_path):
     make(policy_kwargs=given).save(tmp_path / "model")
     assert algorithm.load(tmp_path / "model", policy_kwargs=given).policy.net_arch == [8]
     assert given == dict(net_arch=[8], n_critics=2)
-    assert algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[8])).n_critics == 2
+    assert algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[8], actor_averaging=0.0)).n_critics == 2
     with pytest.raises(ValueError, match=r"policy_kwargs has net_arch=\[9\]: the saved model has \[8\]"):
         algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[9]))
 

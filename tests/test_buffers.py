@@ -244,12 +244,21 @@ def test_an_ended_trajectory_is_followed_by_first_steps():
     assert set(buffer.sample(200).observations[:, 0].tolist()) == {0, 1}  # 0 is of the second: the oldest is never drawn
 
 
-@pytest.mark.parametrize("buffer_class", [FadingReplayBuffer, PrioritizedReplayBuffer])
-def test_an_ended_trajectory_of_single_steps_needs_no_mark(buffer_class):
+@pytest.mark.parametrize("buffer_class", [ReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer])
+def test_an_ended_trajectory_of_single_steps_bootstraps(buffer_class):
     buffer = buffer_class(100, OBS, ACT, handle_timeout_termination=False)
     fill(buffer, 10)
     end_trajectory(buffer)
-    assert not buffer.dones.any()
+    assert not buffer._get_samples(np.arange(10)).dones.any()
+
+
+def test_a_longer_horizon_later_knows_where_a_trajectory_ended():
+    buffer = FadingReplayBuffer(100, OBS, ACT, n_steps=1, gamma=0.5)
+    fill(buffer, 10)
+    end_trajectory(buffer)
+    fill(buffer, 3)
+    buffer.n_steps = 3
+    np.testing.assert_allclose(buffer._get_samples(np.arange(10)).discounts.flatten(), [0.125] * 8 + [0.25, 0.5])
 
 
 @pytest.mark.parametrize("buffer_class", [FadingReplayBuffer, NStepReplayBuffer])

@@ -145,6 +145,14 @@ def test_a_schedule_goes_on_falling():
     assert [seen[0] for seen in note.seen[3::2]] == pytest.approx(expected_rates)
 
 
+def test_a_second_training_starts_with_the_given_rates():
+    note = NoteRates()
+    model = TD3("MlpPolicy", Returns(), learning_rate=1e-3, policy_delay=1, **SMALL)
+    model.learn(16, callback=SlowOnReturn((50, 250), n_episodes=1))
+    model.learn(4, callback=note, reset_num_timesteps=False)
+    assert note.seen[-1] == pytest.approx([1e-3] * 2)
+
+
 def in_one_and_in_two(make, callback, note, tmp_path):
     """What is noted in eight episodes, and in the last four of them where the model comes from a file in between."""
     whole, rest = note(), note()

@@ -332,6 +332,15 @@ def test_frozen_layers_stay_as_they_are(small, algorithm, engine):
     assert all(map(th.equal, frozen, before)) and not any(map(th.equal, last, start))
 
 
+def test_a_frozen_actor_has_its_critics_fitted(make):
+    model = make()
+    model.actor.requires_grad_(False)
+    before = copy.deepcopy([model.actor.state_dict(), model.critic.state_dict()])
+    model.learn(19).learn(60)
+    assert all(th.equal(value, before[0][name]) for name, value in model.actor.state_dict().items())
+    assert not any(th.equal(value, before[1][name]) for name, value in model.critic.state_dict().items())
+
+
 def test_frozen_for_a_while():
     def on_update(i, fitter):
         for parameter in list(fitter.critic.q_networks.parameters())[:2]:

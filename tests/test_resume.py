@@ -619,19 +619,42 @@ def test_resume_that_is_interrupted_before_it_begins(killed, monkeypatch):
     assert_same_results(whole, run)
 
 
-def test_a_configuration_that_was_changed(killed):
-    whole = train(options(log_folder="a")).run.path
-    run = killed(230, options(log_folder="b"))
+CHANGED = {
+    "policy_kwargs": ({"net_arch": [9]}, "size mismatch"),
+    "buffer_size": (150, "buffer_size of its replay buffer is 1000, not 150"),
+    "n_steps": (2, "its replay buffer is no NStepReplayBuffer"),
+    "noise_type": ("ornstein-uhlenbeck", "action_noise: the checkpoint is of another one than OrnsteinUhlenbeckActionNoise"),
+}
+
+
+@pytest.mark.parametrize("key", CHANGED)
+def test_a_configuration_that_was_changed(killed, key):
+    value, message = CHANGED[key]
+    noise = {"noise_type": "normal", "noise_std": 0.1}
+    whole = train(options(log_folder="a", hyperparams={**small("td3"), **noise})).run.path
+    run = killed(230, options(log_folder="b", hyperparams={**small("td3"), **noise}))
     config = run / "Pendulum-v1" / "config.yml"
     before = config.read_text()
-    config.write_text(yaml.safe_dump({**yaml.safe_load(before), "policy_kwargs": {"net_arch": [9]}}))
+    config.write_text(yaml.safe_dump({**yaml.safe_load(before), key: value}))
     with pytest.raises(
-        ConfigError, match=r"config\.yml was changed: the checkpoint at 200 steps is of another model — .*size mismatch"
+        ConfigError, match=r"config\.yml was changed: the checkpoint at 200 steps is of another model — .*" + message
     ):
         resume(run)
     config.write_text(before)
     resume(run)
     assert_same_results(whole, run)
+
+
+def test_an_environment_that_fails_at_the_replay(killed, monkeypatch):
+    """Its error is told as it is."""
+    run = killed(230, options())
+
+    def lost(self, action):
+        raise RuntimeError("lost the connection to the robot")
+
+    monkeypatch.setattr(gym.envs.classic_control.PendulumEnv, "step", lost)
+    with pytest.raises(RuntimeError, match="lost the connection to the robot"):
+        resume(run)
 
 
 def test_a_command_in_another_encoding(killed):

@@ -395,6 +395,29 @@ def test_no_redraw_of_weights_that_were_put_in(pendulum, by):
     assert all(th.equal(value, start[name]) for name, value in model.actor.state_dict().items())
 
 
+def test_an_actor_that_was_put_in_is_who_is_evaluated(pendulum):
+    model = short_model(pendulum(1, 10), learning_starts=35, policy_kwargs={"net_arch": [8], "actor_averaging": 0.3})
+    with th.no_grad():
+        model.actor.mu[-2].bias += 0.5
+    observations = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    for steps in (0, 35):
+        model.learn(steps)
+        one, other = (model.predict(observations, deterministic=deterministic)[0] for deterministic in (True, False))
+        assert np.array_equal(one, other)
+
+
+def test_weights_are_drawn_for_episodes_that_begin_by_a_reset(pendulum):
+    model = short_model(pendulum(1, 10), learning_starts=35)
+    model.learn(100, callback=lambda locals_, globals_: model.num_timesteps < 5)
+    drawn = [model.actor.mu[0].weight.clone()]
+    for reset in (False, True):  # after a stop, and as a new learn()
+        model.learn(2, reset_num_timesteps=reset)
+        drawn.append(model.actor.mu[0].weight.clone())
+    assert not th.equal(drawn[0], drawn[1]) and not th.equal(drawn[1], drawn[2])
+    model.learn(2, reset_num_timesteps=False)  # the same episode
+    assert th.equal(model.actor.mu[0].weight, drawn[2])
+
+
 @pytest.mark.parametrize("steps", [0, 5, 10])
 def test_a_saved_actor_that_was_drawn_is_drawn_again(pendulum, tmp_path, steps):
     model = short_model(pendulum(1, 10), learning_starts=35).learn(steps)

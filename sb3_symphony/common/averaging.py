@@ -41,10 +41,9 @@ class AveragedActor(BasePolicy):
             self.register_buffer("n_averaged", th.zeros((), dtype=th.long, device=self.device))
 
     def restart_average(self) -> None:
-        """Forget all actors but the present one; to be called when it is given other weights than an update's."""
+        """Forget all actors; to be called when the present one is given other weights than an update's."""
         if self.averaged_actor is not None:
             self.n_averaged.zero_()
-            self.averaged_actor.load_state_dict(self.actor.state_dict())
 
     def average_actor(self) -> None:
         """Move the average toward the actor; to be called after each of its updates."""
@@ -58,5 +57,5 @@ class AveragedActor(BasePolicy):
                 averaged.copy_(own)  # statistics of batch normalisation
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        asked = self.averaged_actor if deterministic and self.averaged_actor is not None else self.actor
-        return asked._predict(observation, deterministic)
+        averaged = deterministic and self.averaged_actor is not None and self.n_averaged > 0
+        return (self.averaged_actor if averaged else self.actor)._predict(observation, deterministic)

@@ -399,8 +399,7 @@ def end_trajectory(buffer: ReplayBuffer) -> None:
         return
     if isinstance(buffer, HerReplayBuffer):
         buffer.truncate_last_trajectory()
-    elif getattr(buffer, "n_steps", 1) > 1 or buffer.optimize_memory_usage:
-        # Others need no mark: they bootstrap from the next observation that they stored
+    else:
         last = buffer.pos - 1
         if not buffer.optimize_memory_usage:  # else the next observation will be that of another episode
             buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], buffer.dones[last] == 0)

@@ -142,6 +142,12 @@ class SlowOnReturn(_OnReturn):
         check_pair("factors", factors, "before, after", 0, exclusive=True)
         self.factors = factors
 
+    def _on_training_start(self) -> None:
+        self.model._setup_lr_schedule()  # not as an earlier training has left them
+
+    def _on_training_end(self) -> None:
+        self.model._setup_lr_schedule()
+
     def _follow(self, recent: float) -> None:
         factor = float(np.exp(np.interp(recent, self.returns, np.log(self.factors))))
         self.model._setup_lr_schedule()  # as they were given

@@ -37,6 +37,7 @@ from sb3_symphony import __version__
 from sb3_symphony.common.buffers import end_trajectory
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.files import DamagedFile, checked_content, seal, unseal
+from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm
 from sb3_symphony.common.recording import each_copy, is_recorded, restore_vec_env, vec_env_state
 from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, restore_buffer
 
@@ -140,6 +141,7 @@ def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
 
     :param model: an algorithm inside ``learn()``
     :param state: from :func:`training_state`
+    :raises ValueError: if it is of another model, as far as that is seen; what is not may raise any error
     """
     assert model.env is not None
     vars(model).update(state["attributes"])
@@ -149,8 +151,11 @@ def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     for distribution, (matrix, matrices) in zip(_gsde_distributions(model), state["gSDE"], strict=True):
         distribution.exploration_mat = matrix.to(model.device)
         distribution.exploration_matrices = matrices.to(model.device)
-    if state["noise"] is not None:
-        vars(model.action_noise).update(state["noise"])  # in place: learn() holds it already
+    noise = getattr(model, "action_noise", None)
+    if (state["noise"] or {}).keys() != ({} if noise is None else vars(noise)).keys():
+        raise ValueError(f"action_noise: the checkpoint is of another one than {noise}")
+    if noise is not None:
+        vars(noise).update(state["noise"])  # in place: learn() holds it already
     for name, values in state["log"].items():
         vars(model.logger)[name].update(values)
     restore_vec_env(model.env, state["vec env"])
@@ -274,11 +279,7 @@ class ExactCheckpoints(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if self._restoring is not None:
-            try:
-                self._restore(self._restoring)
-            except (RuntimeError, ValueError, KeyError) as error:  # PyTorch's, NumPy's
-                what = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
-                raise DoesNotFit(f"the checkpoint at {self._restoring.steps} steps is of another model — {what}") from error
+            self._restore(self._restoring)
             self._restoring = None
         elif self.wanted() or self.model.num_timesteps // self.save_freq > self._latest // self.save_freq:
             self.save()
@@ -362,11 +363,15 @@ class ExactCheckpoints(BaseCallback):
         assert model.env is not None
         episodes = state["episodes"] if is_recorded(model.env) else []
         exact = len(episodes) == model.n_envs and all(each_copy(model.env, "replay", episodes))
-        if self._buffer is not None:
-            restore_buffer(self._buffer, state["buffer"], self.segments)
+        try:
+            if self._buffer is not None:
+                restore_buffer(self._buffer, state["buffer"], self.segments)
+            restore_training_state(model, state)
+        except (RuntimeError, ValueError, TypeError, AttributeError, LookupError) as error:  # PyTorch's, NumPy's
+            what = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
+            raise DoesNotFit(f"the checkpoint at {checkpoint.steps} steps is of another model — {what}") from error
         for key, callback in self._named_callbacks():
             vars(callback).update(state["callbacks"].get(key, {}))
-        restore_training_state(model, state)
 
         if not exact:
             each_copy(model.env, "start_anew", episodes)
@@ -385,6 +390,8 @@ class ExactCheckpoints(BaseCallback):
             model._last_original_obs = model.get_vec_normalize_env().get_original_obs()
         if getattr(model, "action_noise", None) is not None:
             model.action_noise.reset()
-        if self._buffer is not None:
+        if isinstance(model, EnsembleOffPolicyAlgorithm):
+            model.start_anew()
+        elif self._buffer is not None:
             end_trajectory(self._buffer)
-            self.segments.forget_latest()
+        self.segments.forget_latest()

@@ -35,7 +35,6 @@ from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
-NOT_LOADED = {"policy", "args", "kwargs", "supported_action_spaces", "support_multi_env", "sde_support", "_init_setup_model"}
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
@@ -241,9 +240,14 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         check_mirror(self.replay_buffer, self._vec_normalize_env)  # now, not after the warm-up
         last_obs = self._last_obs
         result = super()._setup_learn(*args, **kwargs)
-        if self._last_obs is not last_obs and self.replay_buffer is not None:  # the environments were reset
-            end_trajectory(self.replay_buffer)
+        if self._last_obs is not last_obs:
+            self.start_anew()
         return result
+
+    def start_anew(self) -> None:
+        """To be called when all environments were reset: no episode goes on."""
+        if self.replay_buffer is not None:
+            end_trajectory(self.replay_buffer)
 
     # ---------------------------------------------------------------- training
 
@@ -308,9 +312,11 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _step_actor(self, loss: th.Tensor) -> None:
         """One step of the actor. No gradient reaches the critics, nor what is frozen."""
-        self.actor.optimizer.zero_grad()
-        loss.backward(inputs=[parameter for parameter in self.actor.parameters() if parameter.requires_grad])
-        self.actor.optimizer.step()
+        learned = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
+        if learned:
+            self.actor.optimizer.zero_grad()
+            loss.backward(inputs=learned)
+            self.actor.optimizer.step()
 
     def _discounts(self, batch: ReplayBufferSamples) -> th.Tensor | float:
         """Discount of the bootstrap value: ``gamma`` to the power of the steps summed in ``rewards``."""
@@ -370,7 +376,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         :raises TypeError: for another keyword
         :raises ValueError: if an argument is out of range or does not fit the saved model
         """
-        known = {name for base in cls.__mro__ for name in inspect.signature(base).parameters} - NOT_LOADED
+        known = _arguments(cls) - {"policy", "_init_setup_model"}
         for name in kwargs:
             if name not in known:
                 raise TypeError(f"load() got an unexpected argument {name!r}{suggestion(name, known)}")
@@ -379,7 +385,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         for name, value in policy_kwargs.items():
-            saved = model.policy_kwargs.get(name)
+            saved = model.policy_kwargs.get(name, getattr(model.policy, name, None))
             if value != saved:
                 raise ValueError(f"policy_kwargs has {name}={value!r}: the saved model has {saved!r}")
         if "_stats_window_size" in kwargs:
@@ -413,6 +419,18 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def _arguments(class_: type) -> set[str]:
+    """Arguments of its constructor, parents' included where it takes ``**kwargs``."""
+    names: set[str] = set()
+    for base in class_.__mro__:
+        if "__init__" in vars(base):
+            parameters = inspect.signature(base).parameters.values()
+            names |= {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+            if all(each.kind != each.VAR_KEYWORD for each in parameters):
+                break
+    return names
 
 
 def _rows(samples: ReplayBufferSamples, start: int, length: int) -> Any:

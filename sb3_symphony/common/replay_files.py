@@ -1,5 +1,6 @@
 """A replay buffer on disk, to which each checkpoint adds what is new, and buffers that are filled from there."""
 
+import inspect
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -167,7 +168,7 @@ def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
     :param buffer: replay buffer
     :return: what it knows beside its transitions: position, priorities, starts and ends of episodes
     """
-    state = {}
+    state: dict[str, Any] = {}
     for name, value in vars(buffer).items():
         if name in _NOT_BUFFER_STATE or (name == "infos" and not getattr(buffer, "copy_info_dict", True)):
             continue
@@ -179,11 +180,19 @@ def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
 
 def restore_buffer(buffer: ReplayBuffer, state: dict[str, Any], segments: ReplaySegments) -> None:
     """
-    :param buffer: empty buffer of the same sizes
+    :param buffer: empty buffer of the same class and settings
     :param state: from :func:`buffer_state`
     :param segments: its transitions
+    :raises ValueError: if class or settings are others
     :raises DamagedFile: if they cannot be read
     """
+    if state["attributes"].keys() != buffer_state(buffer)["attributes"].keys():
+        raise ValueError(f"its replay buffer is no {type(buffer).__name__}")
+    settings = {name for base in type(buffer).__mro__ for name in inspect.signature(base).parameters}
+    for name in sorted(settings & state["attributes"].keys()):
+        stored, own = state["attributes"][name], vars(buffer)[name]
+        if isinstance(stored, bool | int | float | str | None) and stored != own:
+            raise ValueError(f"{name} of its replay buffer is {stored!r}, not {own!r}")
     segments.load(buffer)
     for name, value in state["attributes"].items():
         current = getattr(buffer, name, None)

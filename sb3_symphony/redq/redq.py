@@ -194,11 +194,13 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             self.ent_coef_tensor = th.tensor(float(initial), device=self.device)
 
     def _resolve_target_entropy(self) -> float:
-        if self.target_entropy == "mbpo" and self.env is not None:
+        if self.target_entropy == "mbpo":
+            if self.env is None:
+                raise ValueError("target_entropy='mbpo': expected an env, whose name it depends on")
             spec = self.env.get_attr("spec")[0]
             name = spec.id.rpartition("/")[2].partition("-")[0] if spec is not None else ""
             return MBPO_TARGET_ENTROPY.get(name, -float(get_action_dim(self.action_space)))
-        if self.target_entropy in ("auto", "mbpo"):
+        if self.target_entropy == "auto":
             return -float(get_action_dim(self.action_space))
         value = _number(self.target_entropy) if isinstance(self.target_entropy, str) else self.target_entropy
         if value is None:

@@ -286,6 +286,10 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             learning_starts = 0  # the actor acts, with noise
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
+    def start_anew(self) -> None:
+        super().start_anew()
+        self._redraw_actor = True
+
     def _actor_weights(self) -> int:
         """Checksum, the same on every device."""
         return zlib.crc32(nn.utils.parameters_to_vector(self.actor.mu.parameters()).detach().cpu().numpy().tobytes())
