@@ -1,6 +1,7 @@
 """Command line: arguments only. Each command calls one function of :mod:`sb3_symphony.experiment`, imported when needed."""
 
 import argparse
+import io
 import os
 import shlex
 import sys
@@ -595,6 +596,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     :return: exit status: 0, 2 for a mistake in the input, 130 after an interruption
     """
     argv = sys.argv[1:] if argv is None else list(argv)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed by the one who started it
+            setattr(sys, name, open(os.devnull, "w"))
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # results are not lost for a character that a terminal does not have
     if "" not in sys.path:
         sys.path.append("")  # one's own robot.py in the working folder is found, as by `python -m`
     namespace, unknown = make_parser().parse_known_args(argv)

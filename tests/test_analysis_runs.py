@@ -174,6 +174,27 @@ def test_seeds_of_one_configuration_are_a_group(tmp_path):
     assert [(group.label, len(group.runs)) for group in groups] == [("sac", 4), ("td3", 1)]
 
 
+def test_runs_that_start_elsewhere_are_another_group(tmp_path):
+    paths = [make_run(tmp_path, number=k, seed=k, gamma=0.9) for k in range(1, 6)]
+    for path, options in zip(
+        paths[1:],
+        [
+            {"trained_agent": "logs/sac/X-v0_1"},
+            {"trained_agent": "logs/sac/X-v0_2"},
+            {"trained_agent": "logs/sac/X-v0_1", "with_replay_buffer": True},
+            {"eval_env_kwargs": {"g": 1.0}},
+        ],
+        strict=True,
+    ):
+        (path / "X-v0" / "args.yml").write_text(yaml.safe_dump({"algo": "sac", "env": "X-v0", **options}))
+    assert [[int(run.path.name[-1]) for run in group.runs] for group in group_runs(map(open_run, paths))] == [
+        [1],
+        [2, 3],
+        [4],
+        [5],
+    ]
+
+
 def test_groups_are_told_apart_by_what_differs(tmp_path):
     paths = [
         make_run(tmp_path, number=1, gamma=0.9, policy_kwargs={"net_arch": [64], "n_critics": 2}),

@@ -196,6 +196,19 @@ def test_nobody_reads_on():
     assert process.stderr.read() == b"" and process.wait() == 141
 
 
+@pytest.mark.parametrize("redirection", [">&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_output(folder, redirection):
+    command = f"{sys.executable} -m sb3_symphony train --algo sac --env Pendulum-v1 -n 20 --device cpu {redirection}"
+    assert subprocess.run(["sh", "-c", command], cwd=folder).returncode == 0
+    assert (folder / "logs" / "sac" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
+
+
+def test_output_that_has_no_such_characters():
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-m", "sb3_symphony", "train", "--help"], env=environment, capture_output=True)
+    assert done.returncode == 0 and done.stderr == b"" and b"?" in done.stdout
+
+
 def test_unknown_command(capsys):
     assert "did you mean 'train'" in fails(capsys, "trian")
     assert "required" in fails(capsys)

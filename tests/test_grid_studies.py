@@ -1,5 +1,6 @@
 """``bench`` with what goes beyond a grid: conditions, searches, agents to start from, algorithms of one's own, figures."""
 
+import copy
 import json
 import shutil
 
@@ -202,6 +203,10 @@ def test_again(study, capsys):
             "was trained with start_from 'base/Pendulum-v1_3'",
         ),
         ({"start_from": None}, "was trained with start_from 'base/Pendulum-v1_3'"),
+        (
+            {"start_from": {"algorithm": "base", "environment": "Pendulum-v1"}},
+            "was trained with start_from.replay_buffer True, the study has False",
+        ),
     ],
 )
 def test_other_agent_to_start_from(study, tmp_path, fails, change, message):
@@ -211,6 +216,38 @@ def test_other_agent_to_start_from(study, tmp_path, fails, change, message):
         (tmp_path / name).write_text((study / name).read_text())
     (tmp_path / "study.yml").write_text(yaml.safe_dump({**STUDY, "algorithms": algorithms}))
     fails(["bench", str(tmp_path / "study.yml"), "--report", "-f", str(study / "results")], message)
+
+
+def test_another_condition_of_the_same_name(study, tmp_path, fails):
+    matrix = copy.deepcopy(STUDY["matrix"])
+    matrix["conditions"][20]["obs_noise"] = 50
+    for name in ("own_td3.py", "space.yml"):
+        (tmp_path / name).write_text((study / name).read_text())
+    (tmp_path / "study.yml").write_text(yaml.safe_dump({**STUDY, "matrix": matrix}))
+    for flags in ([], ["--report"]):
+        fails(["bench", str(tmp_path / "study.yml"), "-f", str(study / "results"), *flags], "evaluated under condition '20'")
+
+
+def test_variants_are_what_plots_tell_apart(study, capsys, fails):
+    results = str(study / "results")
+    assert main(["plot", "-f", results, "-a", "onward", "own", "--json", "-", "-o", str(study / "own.png")]) == 0
+    (panel,) = json.loads(capsys.readouterr().out)["panels"].values()
+    assert [curve["label"] for curve in panel] == ["onward", "own"]
+    fails(["plot", "-f", results, "-a", "onwards"], "did you mean 'onward'?")
+
+
+def test_moved_results_of_an_own_algorithm_go_on(study, tmp_path):
+    shutil.copytree(study / "results", tmp_path / "results")
+    for name in ("own_td3.py", "space.yml"):
+        (tmp_path / name).write_text((study / name).read_text())
+    (tmp_path / "study.yml").write_text(yaml.safe_dump({**STUDY, "steps": 250}))
+    hidden = study / "results" / "settings" / "own_td3.py"
+    hidden.rename(study / "hidden")
+    try:
+        assert main(["bench", str(tmp_path / "study.yml"), "-a", "own", "-f", str(tmp_path / "results")]) == 0
+    finally:
+        (study / "hidden").rename(hidden)
+    assert json.loads((tmp_path / "results" / "own" / "Pendulum-v1_3" / "result.json").read_text())["steps"] == 250
 
 
 def test_raw_files_give_the_same_tables(study, tmp_path, fails):
@@ -226,6 +263,7 @@ def test_raw_files_give_the_same_tables(study, tmp_path, fails):
     assert set(kept) == {"train/learning_rate"} < set(logged)  # what a figure draws
     np.testing.assert_array_equal(kept["train/learning_rate"].steps, logged["train/learning_rate"].steps)
     assert (raw / "rates.png").exists() and not (raw / "onward" / "Pendulum-v1_3" / "scalars.csv").exists()
+    fails(["bench", str(study / "study.yml"), "--dry-run", "--report"], "--dry-run and --report: expected only one of them")
     for flag in ("--collect", "--page"):
         (tmp_path / "page.md").write_text("<!-- results -->\n<!-- /results -->\n")
         fails(["bench", str(study / "study.yml"), flag, str(tmp_path / "page.md")], f"{flag}: ", "belongs to --report")

@@ -149,6 +149,15 @@ def test_statistics_belong_to_models(folder):
     fails("was trained with VecNormalize, but its statistics", **flags, load_best=True)
 
 
+def test_a_configuration_that_is_no_run(folder):
+    """Any project may have one above its models."""
+    (folder / "conf").mkdir()
+    (folder / "conf" / "config.yml").write_text("- lr")
+    (folder / "mine.zip").touch()
+    found = select(model="mine.zip", algo="sac", env="Pendulum-v1")
+    assert found.run is None and not found.normalization_known
+
+
 def test_run_of_rl_zoo(folder):
     run = make_run(folder / "logs", algo="ppo", files=["Pendulum-v1.zip", "Pendulum-v1/vecnormalize.pkl"])
     (run / "Pendulum-v1" / "config.yml").write_text(ZOO_CONFIG)

@@ -11,7 +11,16 @@ import yaml
 
 from sb3_symphony.analysis.matrix import matrix_rows, matrix_table, plot_matrix, positions
 from sb3_symphony.analysis.runs import open_run
-from sb3_symphony.analysis.tables import EPISODE_COLUMNS, Result, Thresholds, as_csv, episode_rows, markdown_table, run_row
+from sb3_symphony.analysis.tables import (
+    EPISODE_COLUMNS,
+    Result,
+    Thresholds,
+    aligned,
+    as_csv,
+    episode_rows,
+    markdown_table,
+    run_row,
+)
 
 WALKER = Thresholds(300.0, 200.0)
 
@@ -250,3 +259,7 @@ def test_matrix(matrix, tmp_path):
 def test_places_of_conditions():
     assert positions(["2", "4", "10"]).tolist() == [2, 4, 10]
     assert positions(["as trained", "delayed"]).tolist() == [0, 1]
+
+
+def test_cells_do_not_break_a_table():
+    assert aligned([["a", "b"], ["x|y", "1\n2"]]) == ["| a    |   b |", "|------|----:|", r"| x\|y | 1 2 |"]

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -275,7 +276,7 @@ def find_runs(folder: Path, algos: Iterable[str], envs: Iterable[str]) -> list[R
     :param folder: where runs are kept
     :param algos: names of algorithms; none: all
     :param envs: ids of environments; none: all
-    :return: the runs, by algorithm in the order given, environment and number
+    :return: the runs, by algorithm in the order given, environment and number; those of a study have its variants' names
     """
     algos, envs = list(algos), [env.rpartition(":")[2].replace("/", "-") for env in envs]
     found = []
@@ -285,7 +286,7 @@ def find_runs(folder: Path, algos: Iterable[str], envs: Iterable[str]) -> list[R
         if number.isdecimal() and (not algos or algo in algos) and (not envs or name in envs):
             if any(path.glob("*.monitor.csv")) or any(path.glob("*/config.yml")):
                 found.append(((algos.index(algo) if algos else 0, algo, name, int(number)), path))
-    return [open_run(path) for _, path in sorted(found)]
+    return [replace(open_run(path), algo=path.parent.name) for _, path in sorted(found)]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -315,6 +316,16 @@ def _flat(config: dict[str, Any], prefix: str = "") -> dict[str, str]:
     return flat
 
 
+def told_apart(run: Run) -> dict[str, Any]:
+    """
+    :param run: a run
+    :return: options that make it another experiment than one of the same configuration: what it starts from, without the
+        number of that run, and where it is evaluated
+    """
+    start = re.sub(r"_\d+$", "", run.options.get("trained_agent") or "")
+    return {"trained_agent": start, **{name: run.options.get(name) for name in ("with_replay_buffer", "eval_env_kwargs")}}
+
+
 def group_runs(runs: Iterable[Run]) -> list[Group]:
     """
     Put runs together that differ in seed and length only.
@@ -329,6 +340,7 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
     settings: list[dict[str, str]] = []
     for run in runs:
         own = {key: value for key, value in _flat(run.config).items() if key != "n_timesteps"}
+        own |= {name: str(value) for name, value in told_apart(run).items() if value}
         for group, setting in zip(groups, settings, strict=True):
             if (group.label, group.env, setting) == (run.algo, run.env, own):
                 group.runs.append(run)

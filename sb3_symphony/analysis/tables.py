@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_symphony.analysis.runs import Run, Scalar
+from sb3_symphony.analysis.runs import Run, Scalar, told_apart
 from sb3_symphony.analysis.statistics import Event, RunEvents, iqm, iqm_event, median_event, run_events, summarise
 
 #: environment seed of the first evaluation episode
@@ -335,6 +335,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     :param rows: names of the columns, then the cells of each row
     :return: lines of a Markdown table that is readable as text too: names to the left, numbers to the right
     """
+    rows = [[" ".join(cell.replace("|", r"\|").split("\n")) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
         f"| {row[0]:{widths[0]}} | "
@@ -445,7 +446,7 @@ def _repeated(results: Sequence[Result]) -> Iterator[str]:
         for second in done[i + 1 :]:
             a, b = first.run, second.run
             assert a is not None and b is not None
-            if (a.algo, a.config, first.seed) == (b.algo, b.config, second.seed):
+            if (a.algo, a.config, told_apart(a), first.seed) == (b.algo, b.config, told_apart(b), second.seed):
                 same = "bit for bit the same" if _episodes_of(first) == _episodes_of(second) else "not the same"
                 both = f"{first.algorithm} and {second.algorithm}"
                 yield f"- {both}: same settings; returns and lengths of all episodes with seed {first.seed} are {same}"

@@ -41,9 +41,10 @@ class AveragedActor(BasePolicy):
             self.register_buffer("n_averaged", th.zeros((), dtype=th.long, device=self.device))
 
     def restart_average(self) -> None:
-        """Forget all actors; to be called when the present one is given other weights than an update's."""
+        """Forget all actors but the present one; to be called when it is given other weights than an update's."""
         if self.averaged_actor is not None:
             self.n_averaged.zero_()
+            self.averaged_actor.load_state_dict(self.actor.state_dict())
 
     def average_actor(self) -> None:
         """Move the average toward the actor; to be called after each of its updates."""

@@ -271,7 +271,8 @@ def run_cell(job: Job) -> bool:
     run = RunFolder(Path(job.run), RunFolder.file_name(options.env))
     if begun(run):
         _wait_for_predecessor(run)
-        again = TrainOptions(resume=str(run.path), n_timesteps=options.n_timesteps, save_freq=options.save_freq)
+        onward = {name: getattr(options, name) for name in ("algo", "n_timesteps", "save_freq")}
+        again = TrainOptions(resume=str(run.path), **onward)
         result = train(again, _command(options))
     else:
         if run.path.exists():
@@ -331,7 +332,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _under_conditions(job: Job) -> dict[str, Any]:
-    return {name: _evaluated(job, different) for name, different in job.conditions.items()}
+    return {name: {"condition": different, **_evaluated(job, different)} for name, different in job.conditions.items()}
 
 
 def _evaluated(job: Job, different: dict[str, Any]) -> dict[str, Any]:

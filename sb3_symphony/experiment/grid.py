@@ -105,6 +105,8 @@ def bench(options: BenchOptions) -> BenchResult:
         raise ConfigError(f"--address: '{options.address}' — is for --backend ray")
     if options.page is not None:
         on_page(options.page, "")
+    if options.dry_run and options.report:
+        raise ConfigError("--dry-run and --report: expected only one of them")
     path = Path(options.study)
     for flag in ("page", "collect"):
         if getattr(options, flag) is not None and not options.report:

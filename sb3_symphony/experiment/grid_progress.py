@@ -1,5 +1,6 @@
 """How far the cells of a grid are, and whether what is there is of the same settings."""
 
+import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,6 +105,7 @@ def _standing(cell: Cell, folder: Path) -> Progress:
     _check_same(progress)
     progress.look()
     result = read_result(run.path)
+    _check_conditions(progress, result or {})
     if result is not None and result["n_timesteps"] == progress.total and _is_evaluated(result, cell):
         progress.state, progress.kept, progress.steps = "done", True, progress.total
     return progress
@@ -112,6 +114,18 @@ def _standing(cell: Cell, folder: Path) -> Progress:
 def _is_evaluated(result: dict[str, Any], cell: Cell) -> bool:
     evaluations = [result.get("final", {}), *(result.get("conditions", {}).get(name, {}) for name in cell.conditions)]
     return all(len(each.get("returns", [])) >= cell.final_episodes for each in evaluations)
+
+
+def _check_conditions(progress: Progress, result: dict[str, Any]) -> None:
+    """Refuse numbers of a condition that has another meaning now."""
+    for name, condition in progress.cell.conditions.items():
+        there = result.get("conditions", {}).get(name, {}).get("condition")  # results of early versions do not tell it
+        wanted = json.loads(json.dumps(condition))
+        if there not in (None, wanted):
+            raise ConfigError(
+                f"{progress.cell.name}: was evaluated under condition '{name}' as {there!r}, the study has {wanted!r} — "
+                "expected the same, another name of it, or another -f"
+            )
 
 
 def _check_same(progress: Progress) -> None:
@@ -127,6 +141,9 @@ def _check_same(progress: Progress) -> None:
     pairs.append(("algo", without_folder(str(stored["options"].get("algo"))), without_folder(cell.options.algo)))
     source = cell.start_from.name if cell.start_from else None
     pairs.append(("start_from", _place(stored["options"].get("trained_agent")), source))
+    if source is not None:
+        replay = bool(stored["options"].get("with_replay_buffer"))
+        pairs.append(("start_from.replay_buffer", replay, cell.options.with_replay_buffer))
     pairs += [(name, stored["config"].get(name), config.get(name)) for name in dict.fromkeys([*stored["config"], *config])]
     for name, there, wanted in pairs:
         if name == "n_timesteps":

@@ -99,7 +99,8 @@ def _groups(options: PlotOptions) -> "list[Group]":
     from sb3_symphony.analysis.runs import find_runs, group_runs, open_run
 
     if options.runs:
-        runs = [open_run(Path(folder)) for folder in options.runs]
+        folders = {Path(folder).resolve(): Path(folder) for folder in options.runs}  # each once
+        runs = [open_run(folder) for folder in folders.values()]
     else:
         runs = find_runs(Path(options.folder), options.algo, options.env)
         for flag, wanted, there in (

@@ -16,6 +16,7 @@ from sb3_symphony.analysis.runs import noted_log, read_evaluations
 from sb3_symphony.common.checkpoint import Checkpoint, checkpoint_files, newest_checkpoint
 from sb3_symphony.common.files import DamagedFile, write_atomically
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
+from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
 #: options that may differ from those the run was started with; nothing that is learned depends on them
@@ -118,6 +119,8 @@ def open_run(options: TrainOptions) -> StoredRun:
         raise ConfigError(f"{found[0]}: {error}") from None
 
     given = {name: getattr(options, name) for name in options.model_fields_set - {"resume"}}
+    if without_folder(given.get("algo", "")) == without_folder(stored.algo):  # the file may have been moved
+        stored = stored.model_copy(update={"algo": given.pop("algo")})
     for name, value in given.items():
         if name not in _CHANGEABLE and value != getattr(stored, name):
             allowed = ", ".join(map(_spelling, sorted(_CHANGEABLE)))

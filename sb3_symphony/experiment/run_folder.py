@@ -9,6 +9,7 @@ import yaml
 
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.registry import without_folder
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class RunFolder:
         :raises ConfigError: if it cannot be written
         """
         env_name = cls.file_name(env_id)
-        parent = Path(log_folder) / algo if path is None else path.parent
+        parent = Path(log_folder) / without_folder(algo) if path is None else path.parent
         try:
             parent.mkdir(parents=True, exist_ok=True)
             while True:
@@ -132,7 +133,8 @@ class RunFolder:
         :param config: merged hyper-parameters, which ``-conf`` reads back
         :param command: the command line
         """
-        contents = {"config.yml": yaml.safe_dump(config, sort_keys=False), "command.txt": command + "\n"}
-        contents["args.yml"] = yaml.safe_dump(options, sort_keys=False)  # the last one: a folder that has it is complete
+        texts = [yaml.safe_dump(each, sort_keys=False, allow_unicode=True) for each in (config, options)]
+        contents = {"config.yml": texts[0], "command.txt": command + "\n"}
+        contents["args.yml"] = texts[1]  # the last one: a folder that has it is complete
         for name, content in contents.items():
             write_atomically(self.details / name, content.encode())

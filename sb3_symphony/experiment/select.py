@@ -150,7 +150,7 @@ def _select(options: SelectOptions) -> Selection:
         else:
             if not path.exists() and path.suffix != ".zip":
                 path = path.with_name(path.name + ".zip")
-            run = next((found for parent in list(path.absolute().parents)[:3] if (found := _run_at(parent))), None)
+            run = next((found for parent in list(path.absolute().parents)[:3] if (found := _run_of(parent))), None)
     elif options.exp_id == -1:
         algo, env_id = options.algo or _DEFAULT_ALGO, options.env or _DEFAULT_ENV
         options = options.model_copy(update={"algo": algo, "env": env_id})
@@ -229,11 +229,19 @@ def _run_at(path: Path) -> RunFolder | None:
     return None
 
 
+def _run_of(path: Path) -> RunFolder | None:
+    """The same, if it is one beyond doubt: any project may have a ``conf/config.yml`` above its models."""
+    run = _run_at(path)
+    if run is not None and not (run.details / "args.yml").is_file() and not run.model.is_file():
+        return None
+    return run
+
+
 def _find_run(options: SelectOptions) -> RunFolder:
     """The run that algorithm, environment, folder and number name."""
     algo, env_id = options.algo or _DEFAULT_ALGO, options.env or _DEFAULT_ENV
     env_name = RunFolder.file_name(env_id)
-    folder = Path(options.folder)
+    folder, algo = Path(options.folder), without_folder(algo)
     numbers = RunFolder.numbers(folder / algo, env_name)
     if not numbers and options.folder == SelectOptions.model_fields["folder"].default and not _which_of_run(options):
         shipped = pretrained_folder()

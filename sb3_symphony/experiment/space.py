@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError, Threads, TrainOptions, read_yaml, shipped_folder
+from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -58,6 +59,13 @@ class TuneOptions(BaseModel):
     num_threads: Threads = -1
     show: bool = False
 
+    @field_validator("study_name")
+    @classmethod
+    def _names_a_folder(cls, value: str | None) -> str | None:
+        if value in (".", ".."):
+            raise ValueError("expected a name (of a folder, too)")
+        return value
+
     @field_validator("n_jobs", "n_timesteps")
     @classmethod
     def _not_zero(cls, value: int) -> int:
@@ -78,7 +86,7 @@ class TuneOptions(BaseModel):
     @property
     def folder(self) -> Path:
         """Where results are written."""
-        return Path(self.log_folder) / self.algo / "tune" / self.name.replace("/", "-")
+        return Path(self.log_folder) / without_folder(self.algo) / "tune" / self.name.replace("/", "-")
 
     @property
     def where(self) -> str:
