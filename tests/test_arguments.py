@@ -408,6 +408,20 @@ def test_unknown_arguments_of_load(make, algorithm, tmp_path):
             algorithm.load(tmp_path / "model", **{name: "CnnPolicy"})
 
 
+class Narrow(REDQ):
+    """Takes less than its parent."""
+
+    def __init__(self, policy, env, device="auto", _init_setup_model=True):
+        small = dict(n_critics=3, buffer_size=100, policy_kwargs=dict(net_arch=[8]))
+        super().__init__(policy, env, device=device, _init_setup_model=_init_setup_model, **small)
+
+
+def test_own_constructors(tmp_path):
+    Narrow("MlpPolicy", "Pendulum-v1").save(tmp_path / "model")
+    loaded = Narrow.load(tmp_path / "model", gamma=0.5)
+    assert (loaded.n_critics, loaded.gamma) == (3, 0.5)
+
+
 def test_statistics_of_load(make, algorithm, tmp_path):
     model = make().learn(76)
     assert len(model.ep_info_buffer) == 3

@@ -1,6 +1,7 @@
 """Argument checks: one clear line that names the argument, its value and what was expected."""
 
 import difflib
+import inspect
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -87,3 +88,22 @@ def suggestion(value: Any, options: Iterable[Any]) -> str:
     by_lower = {str(option).lower(): option for option in options}
     nearest = difflib.get_close_matches(str(value).lower(), by_lower, n=1)
     return f": did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
+
+
+def constructor_parameters(class_: type, eval_str: bool = False) -> dict[str, inspect.Parameter]:
+    """
+    :param class_: any class
+    :param eval_str: whether annotations that are strings are evaluated
+    :return: parameters of its constructor by name, ``self`` included; parents' too where it takes ``**kwargs``
+    """
+    found: dict[str, inspect.Parameter] = {}
+    for parent in class_.__mro__:
+        if "__init__" not in vars(parent):
+            continue
+        parameters = inspect.signature(vars(parent)["__init__"], eval_str=eval_str).parameters.values()
+        for parameter in parameters:
+            if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+                found.setdefault(parameter.name, parameter)
+        if all(parameter.kind != parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return found

@@ -35,6 +35,7 @@ from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
+NOT_LOADED = {"policy", "args", "kwargs", "_init_setup_model"}
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
@@ -376,7 +377,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         :raises TypeError: for another keyword
         :raises ValueError: if an argument is out of range or does not fit the saved model
         """
-        known = _arguments(cls) - {"policy", "_init_setup_model"}
+        algorithms = cls.__mro__[: cls.__mro__.index(EnsembleOffPolicyAlgorithm)]  # what is behind takes what not all have
+        known = {name for each in algorithms for name in inspect.signature(each).parameters} - NOT_LOADED
         for name in kwargs:
             if name not in known:
                 raise TypeError(f"load() got an unexpected argument {name!r}{suggestion(name, known)}")
@@ -419,18 +421,6 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
-
-
-def _arguments(class_: type) -> set[str]:
-    """Arguments of its constructor, parents' included where it takes ``**kwargs``."""
-    names: set[str] = set()
-    for base in class_.__mro__:
-        if "__init__" in vars(base):
-            parameters = inspect.signature(base).parameters.values()
-            names |= {each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
-            if all(each.kind != each.VAR_KEYWORD for each in parameters):
-                break
-    return names
 
 
 def _rows(samples: ReplayBufferSamples, start: int, length: int) -> Any:

@@ -1,6 +1,5 @@
 """A replay buffer on disk, to which each checkpoint adds what is new, and buffers that are filled from there."""
 
-import inspect
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import end_trajectory
+from sb3_symphony.common.checks import constructor_parameters
 from sb3_symphony.common.files import seal, unseal
 
 _STORAGE = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -188,8 +188,7 @@ def restore_buffer(buffer: ReplayBuffer, state: dict[str, Any], segments: Replay
     """
     if state["attributes"].keys() != buffer_state(buffer)["attributes"].keys():
         raise ValueError(f"its replay buffer is no {type(buffer).__name__}")
-    settings = {name for base in type(buffer).__mro__ for name in inspect.signature(base).parameters}
-    for name in sorted(settings & state["attributes"].keys()):
+    for name in sorted(constructor_parameters(type(buffer)).keys() & state["attributes"].keys()):
         stored, own = state["attributes"][name], vars(buffer)[name]
         if isinstance(stored, bool | int | float | str | None) and stored != own:
             raise ValueError(f"{name} of its replay buffer is {stored!r}, not {own!r}")

@@ -22,7 +22,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_symphony.common.checks import suggestion
+from sb3_symphony.common.checks import constructor_parameters, suggestion
 from sb3_symphony.experiment.config import ConfigError, RunConfig, RunSettings
 
 _SB3 = "stable_baselines3.common"
@@ -134,19 +134,8 @@ def argument_types(class_: type) -> dict[str, Any]:
     :param class_: any class
     :return: arguments of its constructor with their annotations, parents' included where it takes ``**kwargs``
     """
-    found: dict[str, Any] = {}
-    for parent in class_.__mro__:
-        if "__init__" not in vars(parent):
-            continue
-        init = vars(parent)["__init__"]
-        parameters = inspect.signature(init, eval_str=True).parameters.values()
-        for parameter in parameters:
-            if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
-                annotation = Any if parameter.annotation is parameter.empty else parameter.annotation
-                found.setdefault(parameter.name, _plain(annotation))
-        if all(parameter.kind != parameter.VAR_KEYWORD for parameter in parameters):
-            break
-    return found
+    annotations = {name: each.annotation for name, each in constructor_parameters(class_, eval_str=True).items()}
+    return {name: Any if each is inspect.Parameter.empty else _plain(each) for name, each in annotations.items()}
 
 
 def check_keys(given: Iterable[str], known: Iterable[str], what: str, owner: str) -> None:
@@ -309,7 +298,7 @@ def _action_noise(value: Any, n_actions: int | tuple[int, ...], n_envs: int) -> 
         raise ConfigError(f"action_noise: {name}: {error}") from None
 
 
-def _policy_kwargs(value: Any, policy_class: type) -> dict[str, Any]:
+def _policy_kwargs(value: Any, policy_class: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(f"policy_kwargs: {value!r} — expected a mapping")
     types = argument_types(policy_class)
@@ -322,13 +311,10 @@ def _policy_kwargs(value: Any, policy_class: type) -> dict[str, Any]:
         item = _named_classes(key, plain) if key in _CLASSES and plain is not None else plain
         decoded[key] = _typed(key, plain, item, types[key], -math.inf)
     for part, filled in _PARTS.items():
-        signatures = (inspect.signature(parent).parameters for parent in policy_class.__mro__)
-        default = next((known[f"{part}_class"].default for known in signatures if f"{part}_class" in known), None)
-        class_ = decoded.get(f"{part}_class") or default or getattr(policy_class, "default_features_extractor", None)
-        if class_ is not None and decoded.get(f"{part}_kwargs"):
-            check_keys(
-                decoded[f"{part}_kwargs"], argument_types(class_).keys() - filled, f"{part}_kwargs key", class_.__name__
-            )
+        if given := decoded.get(f"{part}_kwargs"):
+            default = constructor_parameters(policy_class)[f"{part}_class"].default
+            class_ = decoded.get(f"{part}_class") or default or policy_class.default_features_extractor
+            check_keys(given, argument_types(class_).keys() - filled, f"{part}_kwargs key", class_.__name__)
     return decoded
 
 
