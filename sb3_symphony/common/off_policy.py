@@ -27,7 +27,7 @@ from sb3_symphony.common.buffers import (
     check_mirror,
     end_trajectory,
 )
-from sb3_symphony.common.checks import check_choice, check_number, suggestion
+from sb3_symphony.common.checks import check_choice, check_number, constructor_parameters, suggestion
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CLASSIFICATION, CRITIC_LOSSES
 from sb3_symphony.common.noise import DecayingActionNoise
@@ -35,7 +35,6 @@ from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
-NOT_LOADED = {"policy", "args", "kwargs", "_init_setup_model"}
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
@@ -378,7 +377,11 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         :raises ValueError: if an argument is out of range or does not fit the saved model
         """
         algorithms = cls.__mro__[: cls.__mro__.index(EnsembleOffPolicyAlgorithm)]  # what is behind takes what not all have
-        known = {name for each in algorithms for name in inspect.signature(each).parameters} - NOT_LOADED
+        known = {name for each in algorithms for name in constructor_parameters(each)} - {
+            "self",
+            "policy",
+            "_init_setup_model",
+        }
         for name in kwargs:
             if name not in known:
                 raise TypeError(f"load() got an unexpected argument {name!r}{suggestion(name, known)}")

@@ -240,6 +240,13 @@ class Quick(BaseModel):
     sweeps: dict[str, Any] = {}
 
 
+def _settled(options: Any, names: Iterable[str], instead: str = "") -> None:
+    """Refuse options of a command that a study settles itself."""
+    for name in names:
+        if isinstance(options, dict) and name in options:
+            raise ConfigError(f"'{name}' — is for the command line{instead}")
+
+
 #: options of ``tune`` that a study does not settle
 _NOT_OF_SWEEPS = ("log_folder", "n_jobs", "num_threads", "storage", "study_name", "show", "heartbeat", "device")
 
@@ -251,9 +258,7 @@ def _sweeps(value: Any) -> Any:
 
 
 def _sweep(options: Any) -> TuneOptions:
-    for name in _NOT_OF_SWEEPS:
-        if isinstance(options, dict) and name in options:
-            raise ConfigError(f"'{name}' — is for the command line")
+    _settled(options, _NOT_OF_SWEEPS)
     return _part(TuneOptions, "algo", options)
 
 
@@ -273,9 +278,7 @@ def _figures(value: Any) -> Any:
 
 
 def _figure(options: Any) -> "Drawing":
-    for name in _NOT_OF_FIGURES:
-        if isinstance(options, dict) and name in options:
-            raise ConfigError(f"'{name}' — is for the command line; a figure has algorithms and environments of the study")
+    _settled(options, _NOT_OF_FIGURES, "; a figure has algorithms and environments of the study")
     drawing: Drawing = _part(Drawing, None, options)
     check_options(drawing)
     return drawing

@@ -277,12 +277,13 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         if self.warmup_policy == "actor" and self.num_timesteps < learning_starts:
-            # Never one that was trained, here or elsewhere: its weights are no longer those that were drawn
-            if self._redraw_actor and self._actor_weights() == self._drawn_weights:
-                self.actor.redraw()
-                self._drawn_weights = self._actor_weights()
-                self.policy.restart_average()
+            if self._redraw_actor:
                 self._redraw_actor = False
+                # Never one that was trained, here or elsewhere: its weights are no longer those that were drawn
+                if self._actor_weights() == self._drawn_weights:
+                    self.actor.redraw()
+                    self._drawn_weights = self._actor_weights()
+                    self.policy.restart_average()
             learning_starts = 0  # the actor acts, with noise
         return super()._sample_action(learning_starts, action_noise, n_envs)
 
