@@ -37,7 +37,6 @@ from sb3_symphony import __version__
 from sb3_symphony.common.buffers import end_trajectory
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.files import DamagedFile, checked_content, seal, unseal
-from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm
 from sb3_symphony.common.recording import each_copy, is_recorded, restore_vec_env, vec_env_state
 from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, restore_buffer
 
@@ -390,7 +389,7 @@ class ExactCheckpoints(BaseCallback):
             model._last_original_obs = model.get_vec_normalize_env().get_original_obs()
         if getattr(model, "action_noise", None) is not None:
             model.action_noise.reset()
-        if isinstance(model, EnsembleOffPolicyAlgorithm):
+        if hasattr(model, "start_anew"):  # of this package; its algorithms are not imported for those of others
             model.start_anew()
         elif self._buffer is not None:
             end_trajectory(self._buffer)
