@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_symphony import REDQ, Symphony
 from sb3_symphony.common.callbacks import GreedyEpisodes
+from sb3_symphony.common.checkpoint import ExactCheckpoints, newest_checkpoint
 from sb3_symphony.common.noise import StickyActionNoise
 from sb3_symphony.common.off_policy import ActsGreedily
 from sb3_symphony.common.wrappers import RewardScale
@@ -211,6 +212,25 @@ def test_a_killed_run_goes_on_alike(algo, tmp_path):
     half = train(TrainOptions(**common, n_timesteps=500, log_folder=str(tmp_path / "half"))).run.path
     train(TrainOptions(resume=str(half), n_timesteps=900))
     assert_same_results(whole, half)
+
+
+def test_fresh_episodes_of_a_resumed_run(tmp_path):
+    """The given-up episode was greedy until it stalled: its rewards do not count, and another one is greedy in its place."""
+
+    def parts():
+        greedy = GreedyEpisodes(ALWAYS, (3, 9), stall_reward=0.4, stall_steps=2, n_episodes=1)
+        return make("symphony", Fixed(falls=0), learning_starts=1), greedy
+
+    model, greedy = parts()
+    exact = ExactCheckpoints(tmp_path, LENGTH + 3, callbacks=[greedy])
+    model.learn(LENGTH + 4, callback=[greedy, exact])  # a checkpoint is made when a rollout starts
+    assert not model.greedy_envs.any() and list(greedy.rewards[0]) == [0, 0] and greedy.row == [1]
+
+    model, greedy = parts()
+    note = Note()
+    exact = ExactCheckpoints(tmp_path, 100, callbacks=[greedy], checkpoint=newest_checkpoint(tmp_path))
+    model.learn(2 * LENGTH + 3, callback=[greedy, exact, note])
+    assert [each[0] for each in note.seen] == [True] * 2 + [False] * (LENGTH - 2)
 
 
 @pytest.mark.parametrize(

@@ -246,11 +246,14 @@ class GreedyEpisodes(_OnReturn):
             raise TypeError(f"model: expected one with greedy episodes, such as Symphony, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
+        self.row = [0] * self.training_env.num_envs
+        self.start_anew()
+
+    def start_anew(self) -> None:
+        """Episodes begin that none has ended before: they are of the kind that those given up were meant to be."""
         model: Any = self.model
-        n_envs = self.training_env.num_envs
-        self.rewards = [deque(maxlen=self.stall_steps) for _ in range(n_envs)]
-        self.row = [0] * n_envs
-        model.greedy_envs = np.zeros(n_envs, dtype=bool)
+        self.rewards = [deque(maxlen=self.stall_steps) for _ in self.row]
+        model.greedy_envs = np.array(self.row) > 0  # (n_envs,)
 
     def _on_step(self) -> bool:
         model: Any = self.model

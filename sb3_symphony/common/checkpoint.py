@@ -393,4 +393,7 @@ class ExactCheckpoints(BaseCallback):
             model.start_anew()
         elif self._buffer is not None:
             end_trajectory(self._buffer)
+        for callback in self.callbacks:
+            if hasattr(callback, "start_anew"):
+                callback.start_anew()
         self.segments.forget_latest()
