@@ -1,6 +1,7 @@
 """Command line: arguments only. Each command calls one function of :mod:`sb3_symphony.experiment`, imported when needed."""
 
 import argparse
+import errno
 import io
 import os
 import shlex
@@ -588,6 +589,11 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _forget_output() -> None:
+    """What could not be written: Python would try again, and tell it again, when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run the command line.
@@ -624,5 +630,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # of `sb3-symphony … | head`: nobody reads any more
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python tells it again when it ends
+        _forget_output()
         return 141  # as a shell reports SIGPIPE
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        print(f"sb3-symphony {command}: error: output cannot be written — {error.strerror}", file=sys.stderr)
+        _forget_output()
+        return 2

@@ -196,6 +196,16 @@ def test_nobody_reads_on():
     assert process.stderr.read() == b"" and process.wait() == 141
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_output_on_a_full_disk(unbuffered):
+    command = [sys.executable, "-m", "sb3_symphony", "list"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, env={**os.environ, "PYTHONUNBUFFERED": unbuffered}, stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 2 and done.stderr.count(b"\n") == 1
+    assert b"error: output cannot be written" in done.stderr
+
+
 @pytest.mark.parametrize("redirection", [">&-", ">&- 2>&-", "<&- >&- 2>&-"])
 def test_closed_output(folder, redirection):
     command = f"{sys.executable} -m sb3_symphony train --algo sac --env Pendulum-v1 -n 20 --device cpu {redirection}"

@@ -218,6 +218,28 @@ def test_other_agent_to_start_from(study, tmp_path, fails, change, message):
     fails(["bench", str(tmp_path / "study.yml"), "--report", "-f", str(study / "results")], message)
 
 
+def test_a_search_of_another_space(study, tmp_path, fails):
+    (tmp_path / "own_td3.py").write_text(OWN)
+    (tmp_path / "space.yml").write_text("learning_rate: [1e-3, 1e-5]\n")
+    (tmp_path / "study.yml").write_text(yaml.safe_dump(STUDY))
+    message = "has space: learning_rate [0.001, 0.0001], not [0.001, 1e-05]"
+    for flags in ([], ["--report"]):
+        fails(["bench", str(tmp_path / "study.yml"), "-f", str(study / "results"), *flags], "the search 'rate' in '", message)
+    sweep = {**STUDY["sweeps"]["rate"], "n_trials": 3}  # goes on
+    (tmp_path / "study.yml").write_text(yaml.safe_dump({**STUDY, "sweeps": {"rate": sweep}}))
+    assert main(["bench", str(tmp_path / "study.yml"), "-f", str(study / "results"), "--dry-run", "-a", "base"]) == 0
+
+
+def test_more_steps_of_an_agent_that_another_began_with(study, tmp_path, fails):
+    for name in ("own_td3.py", "space.yml"):
+        (tmp_path / name).write_text((study / name).read_text())
+    base, *others = STUDY["algorithms"]
+    (tmp_path / "study.yml").write_text(yaml.safe_dump({**STUDY, "algorithms": [{**base, "steps": 300}, *others]}))
+    message = "onward/Pendulum-v1_3: began with base/Pendulum-v1_3 after 200 steps, the study has 300 of them"
+    for flags in ([], ["--report"], ["--dry-run"]):
+        fails(["bench", str(tmp_path / "study.yml"), "-f", str(study / "results"), *flags], message)
+
+
 def test_another_condition_of_the_same_name(study, tmp_path, fails):
     matrix = copy.deepcopy(STUDY["matrix"])
     matrix["conditions"][20]["obs_noise"] = 50

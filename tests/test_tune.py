@@ -1,6 +1,7 @@
 """Sweeps: which trials are run, what is told to Optuna, and what is found. Most trainings are played, some are real."""
 
 import csv
+import json
 import os
 import signal
 import time
@@ -394,6 +395,8 @@ def test_files(played, options, tmp_path, monkeypatch):
     assert content["learning_rate"] == best.params["learning_rate"] and content["n_steps"] == 16
     assert f"Trial {best.number} " in text and "-conf logs/ppo/tune/ppo-Line-v0/best.yml" in text
     assert f"best: trial {best.number}, {best.value:.2f}" in result.summary
+    plan = json.loads((result.folder / "plan.json").read_text())
+    assert plan["seeds"] == [100, 101] and "learning_rate" in plan["space"]
 
 
 def test_show(played, options, tmp_path, capsys):

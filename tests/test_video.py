@@ -265,6 +265,7 @@ def test_mujoco(tmp_path, monkeypatch):
         ("--n-episodes 0", "n_episodes: 0"),
         ("--labels a b", "--labels: 2 given — expected 1"),
         ("agent.zip -o a.mp4", "2 agents give 2 files, see --grid"),
+        ("./agent", "agent.mp4' would be the film of two agents"),
         ("nothing.zip", "nothing.zip: no such file"),
         ("--model agent.zip", "expected either --model or agent.zip, not both"),
         ("--env Blind-v0", "Blind-v0: draws no pictures"),

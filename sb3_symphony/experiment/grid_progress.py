@@ -12,7 +12,7 @@ from sb3_symphony.experiment.cell import begun, read_result
 from sb3_symphony.experiment.config import ConfigError, RunConfig, parse_yaml, read_yaml
 from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
-from sb3_symphony.experiment.study import Cell, Study, cells_of, configuration
+from sb3_symphony.experiment.study import Cell, Study, cells_of, configuration, found_by, sweep_options
 
 State = Literal["queued", "running", "done", "failed", "stopped"]
 
@@ -82,14 +82,30 @@ def standings(study: Study, path: Path, folder: Path) -> list[Progress]:
     :param path: its file
     :param folder: where results are kept
     :return: the cells, and how far each is
-    :raises ConfigError: if a run that is there has other settings
+    :raises ConfigError: if a run or search that is there has other settings
     """
+    _check_searches(study, path.absolute().parent, folder)
     progress = [_standing(cell, folder) for cell in cells_of(study, path.absolute().parent, folder)]
     reported = {each.name: each.reported for each in study.algorithms}
+    known = {each.cell.name: each for each in progress}
     for each in progress:
+        if each.cell.start_from is not None:
+            _check_beginning(each, known[each.cell.start_from.name])
         told = reported[each.cell.algorithm]
         each.reported = told if isinstance(told, str) else told.get(each.cell.environment.id, "")
     return progress
+
+
+def _check_searches(study: Study, beside: Path, folder: Path) -> None:
+    """Refuse the best settings of a search that the study describes otherwise now."""
+    for name in study.sweeps:
+        options = sweep_options(study, name, beside, folder)
+        plan = options.folder / "plan.json"  # results of early versions have none
+        if found_by(study, name, folder).is_file() and plan.is_file():
+            from sb3_symphony.experiment.tune import Plan  # Optuna takes a second
+
+            searched = json.loads(plan.read_text(encoding="utf-8"))
+            Plan.read(options).check_same(searched, f"the search '{name}' in '{options.folder}'")
 
 
 def _standing(cell: Cell, folder: Path) -> Progress:
@@ -155,6 +171,16 @@ def _check_same(progress: Progress) -> None:
             raise ConfigError(
                 f"{cell.name}: was trained with {name} {there!r}, the study has {wanted!r} — expected the same, or another -f"
             )
+
+
+def _check_beginning(progress: Progress, source: Progress) -> None:
+    """Refuse more steps for an agent that another run has begun with: other seeds would begin with an older one."""
+    result = read_result(source.run.path)
+    if result is not None and result["n_timesteps"] != source.total and begun(progress.run):
+        raise ConfigError(
+            f"{progress.cell.name}: began with {source.cell.name} after {result['n_timesteps']} steps, the study has "
+            f"{source.total} of them — expected as many, or another -f"
+        )
 
 
 def _place(run: str | None) -> str | None:

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 #: files of a run, and beside the runs, that a report needs or that tell what a search has found
 _RAW = ("*/args.yml", "*/config.yml", "*.monitor.csv", "evaluations.npz", "result.json")
-_RAW_BESIDE = ("settings/*_best_of_*.yml", "sweeps/*/tune/*/*.csv", "sweeps/*/tune/*/best.yml", "sweeps/*/tune/*/*.png")
+_RAW_BESIDE = (
+    "settings/*_best_of_*.yml",
+    *(f"sweeps/*/tune/*/{name}" for name in ("*.csv", "best.yml", "plan.json", "*.png")),
+)
 
 
 def collect(study: Study, progress: Sequence[Progress], folder: Path, target: Path) -> None:

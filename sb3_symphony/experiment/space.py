@@ -62,8 +62,8 @@ class TuneOptions(BaseModel):
     @field_validator("study_name")
     @classmethod
     def _names_a_folder(cls, value: str | None) -> str | None:
-        if value in (".", ".."):
-            raise ValueError("expected a name (of a folder, too)")
+        if value is not None and (value in (".", "..") or "/" in value):
+            raise ValueError("expected a name, of a folder, too: without '/'")
         return value
 
     @field_validator("n_jobs", "n_timesteps")
@@ -86,7 +86,8 @@ class TuneOptions(BaseModel):
     @property
     def folder(self) -> Path:
         """Where results are written."""
-        return Path(self.log_folder) / without_folder(self.algo) / "tune" / self.name.replace("/", "-")
+        folder_name = self.name.replace("/", "-")  # the default one may hold the path of an algorithm's file
+        return Path(self.log_folder) / without_folder(self.algo) / "tune" / folder_name
 
     @property
     def where(self) -> str:

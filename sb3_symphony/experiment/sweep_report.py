@@ -121,12 +121,13 @@ class SweepReport:
 
     def write(self) -> None:
         """
-        Write ``trials.csv`` and, if a trial has completed, ``best.yml`` and figures.
+        Write ``plan.json``, ``trials.csv`` and, if a trial has completed, ``best.yml`` and figures.
 
         :raises ConfigError: if they cannot be written
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.folder / "plan.json", json.dumps(self.plan, indent=1).encode())
             rows = self.rows()
             if rows:
                 table = io.StringIO()

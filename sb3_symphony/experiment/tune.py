@@ -123,6 +123,14 @@ class Plan:
         where = f"--study-name: '{study.study_name}' in {storage}"
         if found is None:
             raise ConfigError(f"{where} was not made by this command — expected another name")
+        self.check_same(found, where)
+
+    def check_same(self, found: dict[str, Any], where: str) -> None:
+        """
+        :param found: an earlier plan, as :meth:`plain` gives it
+        :param where: where it comes from, for messages
+        :raises ConfigError: if this is another one
+        """
         for key, value in self.plain().items():
             if found.get(key) != value:
                 what, there, here = _difference(key, found.get(key), value)

@@ -376,13 +376,15 @@ def video(options: VideoOptions) -> list[Path]:
         films = [agents] if options.grid else [[agent] for agent in agents]
         if options.output is not None and len(films) > 1:
             raise ConfigError(f"--output: '{options.output}' — {len(films)} agents give {len(films)} files, see --grid")
-        written = []
+        outputs: list[Path] = []
         for film in films:
             output = output_file(options.output or _default_output(options, film), "--output", SUFFIXES)
             if output.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
                 raise ConfigError(f'{output}: MP4 needs imageio-ffmpeg: pip install "sb3-symphony[video]" — or use .gif')
-            written.append(_film(film, options, output))
-        return written
+            if output in outputs:
+                raise ConfigError(f"'{output}' would be the film of two agents — expected each agent once, or --grid")
+            outputs.append(output)
+        return [_film(film, options, output) for film, output in zip(films, outputs, strict=True)]
 
 
 def _film(agents: Sequence[Shown], options: VideoOptions, output: Path) -> Path:
