@@ -6,6 +6,7 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
@@ -42,6 +43,13 @@ CASES = [
     *((name, value) for name, values in INTEGERS.items() for value in (*values, *WRONG, 1.5)),
     *((name, value) for name, values in NUMBERS.items() for value in (*values, *WRONG)),
 ]
+
+
+def test_whole_numbers_as_actions(make):
+    """Scaled to [-1, 1] they are not whole, and a buffer of whole numbers would cut them."""
+    env = gym.wrappers.TransformAction(gym.make("Pendulum-v1"), float, gym.spaces.Box(0, 5, (1,), dtype=np.int64))
+    with pytest.raises(ValueError, match=re.escape("action_space=Box(0, 5, (1,), int64): expected real numbers")):
+        make(env)
 
 
 @pytest.mark.parametrize("name, value", CASES, ids=lambda x: str(x))
@@ -314,6 +322,13 @@ def test_numpy_numbers_are_numbers(make, algorithm):
         gamma=np.float64(0.9),
         **extra,
     ).learn(30)
+
+
+def test_a_discount_of_numpy_leaves_samples_in_single_precision(make):
+    classifying = dict(critic_loss="hl_gauss", policy_kwargs=dict(value_range=(-100, 0)))
+    model = make(n_steps=3, gamma=np.float64(0.9), tau=np.float64(0.1), **classifying).learn(40)
+    samples = model.replay_buffer.sample(4)
+    assert samples.discounts.dtype == samples.rewards.dtype == th.float32
 
 
 def test_edges_are_allowed(make):

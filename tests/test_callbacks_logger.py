@@ -156,6 +156,14 @@ def test_update_ratio_counts_all_updates(small, tmp_path):
     assert np.diff(updates).tolist() == [32, 32, 32]
 
 
+def test_update_ratio_of_a_long_call(make):
+    """On what is in the buffer already. Values are those of the latest 1 000 updates, the ratio counts all."""
+    model = make().learn(40, log_interval=None)
+    model.dump_logs()
+    model.train(gradient_steps=1100, batch_size=4)
+    assert model.logger.name_to_value["train/update_ratio"] == 1100
+
+
 def test_update_ratio_after_a_second_learn(make, algorithm):
     """The count of steps restarts, the ratio stays positive and right."""
     model = make(**no_extra_updates(algorithm)).learn(60)

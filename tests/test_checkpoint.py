@@ -142,9 +142,43 @@ def test_what_cannot_be_recorded():
         record_episodes(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
 
 
-@pytest.mark.parametrize("buffer_size", [1000, 60, 45])
+@pytest.mark.parametrize("buffer_size", [1000, 60, 45, 30])
 def test_buffer_that_was_not_empty(tmp_path, small, pendulum, buffer_size):
     compared(tmp_path, lambda: small(REDQ, pendulum(), buffer_size=buffer_size).learn(45))
+
+
+@pytest.mark.parametrize("buffer_size", [1000, 60])
+def test_a_training_that_goes_on(tmp_path, small, pendulum, buffer_size):
+    """A second training with checkpoints, and a third one with the same callback; the count goes on."""
+    model = small(REDQ, pendulum(), buffer_size=buffer_size).learn(45)
+    record_episodes(model.env)
+    exact = ExactCheckpoints(tmp_path, 30)
+    for steps in (40, 40):
+        model.learn(steps, reset_num_timesteps=False, callback=exact)
+    resumed = small(REDQ, pendulum(), buffer_size=buffer_size)
+    record_episodes(resumed.env)
+    resumed.learn(125, callback=ExactCheckpoints(tmp_path, 30, checkpoint=newest_checkpoint(tmp_path)))
+    for name in ("observations", "actions", "rewards"):
+        stored, there = (getattr(each.replay_buffer, name) for each in (model, resumed))
+        assert (stored == there).all()
+    assert resumed.num_timesteps == model.num_timesteps == 125
+
+
+def test_a_callback_may_change_the_exponent_of_weights(tmp_path, small, pendulum):
+    class Rising(BaseCallback):
+        def _on_step(self):
+            self.model.replay_buffer.beta = min(1.0, 0.4 + self.num_timesteps / 200)
+            return True
+
+    def make():
+        model = small(REDQ, pendulum(), replay_buffer_class=PrioritizedReplayBuffer)
+        record_episodes(model.env)
+        return model
+
+    make().learn(70, callback=[Rising(), ExactCheckpoints(tmp_path, 60)])
+    model = make()
+    model.learn(62, callback=ExactCheckpoints(tmp_path, 60, checkpoint=newest_checkpoint(tmp_path)))
+    assert model.replay_buffer.beta == 0.4 + 60 / 200
 
 
 def fresh(tmp_path, make, steps, at, capsys):

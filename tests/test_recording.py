@@ -1,6 +1,7 @@
 """Episodes that are recorded, and made again from their actions."""
 
 import pickle
+import types
 
 import gymnasium as gym
 import numpy as np
@@ -82,6 +83,76 @@ def test_wrappers_have_their_counts_again():
     limits = [env.get_wrapper_attr("total_steps"), other.get_wrapper_attr("total_steps")]
     assert limits[0] == limits[1] == 36
     assert difference(other.step(np.array([0.5])), env.step(np.array([0.5]))) is None
+
+
+class Arm(gym.Env):
+    """Its state is a part of its own, and an array that it never replaces."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self):
+        self.data = types.SimpleNamespace(speed=0.0)
+        self.angles = np.zeros(1)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.data.speed, self.angles[:] = self.np_random.uniform(), 0.0
+        return np.zeros(2, dtype=np.float32), {}
+
+    def step(self, action):
+        self.data.speed += float(action[0])
+        self.angles += self.data.speed
+        return np.array([self.data.speed, self.angles[0]], dtype=np.float32), 0.0, False, False, {}
+
+
+class PaidByTheSimulator(gym.Wrapper):
+    def __init__(self, env, view):
+        super().__init__(env)
+        self.data, self.angles = env.unwrapped.data, env.unwrapped.angles[:] if view else env.unwrapped.angles
+        self.best = 0.0
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        self.best = max(self.best, self.angles[0])
+        return observation, self.data.speed + 10 * self.angles[0] + 100 * self.best, *rest
+
+
+@pytest.mark.parametrize("view", [False, True])
+@pytest.mark.parametrize("outside", [False, True])
+def test_what_wrappers_see_of_the_simulator_stays_that(view, outside):
+    def make():
+        env = Monitor(Arm()) if outside else Arm()
+        env = PaidByTheSimulator(env, view)
+        return RecordedEpisode(env if outside else Monitor(env))
+
+    env, other = make(), make()
+    env.reset(seed=0)
+    for move in (0.5, -0.5, 0.25):
+        env.step(np.array([move]))
+    other.reset(seed=1)
+    assert other.replay(env.recorded_state())
+    for move in (0.5, -1.0):
+        assert difference(other.step(np.array([move])), env.step(np.array([move]))) is None
+    other.start_anew(env.recorded_state())
+    rewards = []
+    for each in (env, other):
+        each.reset()
+        rewards.append(each.step(np.array([0.5]))[1])
+    assert rewards[0] == rewards[1]
+
+
+def test_rewards_that_come_out_otherwise_are_noticed():
+    """Those of a wrapper around the monitor, which does not see them."""
+
+    class Drawn(gym.RewardWrapper):
+        def reward(self, reward):
+            return reward + np.random.uniform()
+
+    env = RecordedEpisode(Drawn(Monitor(Arm())))
+    env.reset(seed=0)
+    env.step(np.array([0.5]))
+    assert not env.replay(env.recorded_state())
 
 
 @pytest.mark.parametrize("where, moves", [("observation", 0), ("reward", 1)])

@@ -1,6 +1,9 @@
 import copy
 import inspect
+import pickle
 
+import cloudpickle
+import numpy as np
 import pytest
 import torch as th
 from maths_helpers import OBS_DIM, assert_same_weights, batch_of, box, make_critic, perturb, separate_networks
@@ -350,6 +353,86 @@ def test_frozen_for_a_while():
     for fitter in fitters:
         run(fitter, on_update=on_update)
     assert_equal_states(*fitters)
+
+
+# What others do with the critics --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hooked", ["gradient", "accumulated", "step"])
+def test_hooks_are_called(hooked):
+    """To clip gradients, for example; for some of the updates."""
+
+    def halve(parameter):
+        parameter.grad.mul_(0.5)
+
+    def hook(critic):
+        if hooked == "gradient":
+            return [parameter.register_hook(lambda grad: 0.5 * grad) for parameter in critic.q_networks.parameters()]
+        if hooked == "accumulated":
+            return [parameter.register_post_accumulate_grad_hook(halve) for parameter in critic.q_networks.parameters()]
+        return [critic.optimizer.register_step_pre_hook(lambda *_: [*map(halve, critic.q_networks.parameters())] and None)]
+
+    fitters, untouched = pair(optimizer_kwargs=dict(eps=0.1)), regression("autograd", optimizer_kwargs=dict(eps=0.1))
+    for fitter in fitters:
+        run(fitter, 5)
+        hooks = hook(fitter.critic)
+        run(fitter, 5, first=5)
+        for each in hooks:
+            each.remove()
+        run(fitter, 5, first=10)
+    assert_equal_states(*fitters)
+    run(untouched, 15)
+    assert any((state_of(untouched)[name] - value).abs().max() > 1e-6 for name, value in state_of(fitters[0]).items())
+
+
+@pytest.mark.parametrize("optimizer, kwargs", [(th.optim.SGD, {}), (th.optim.Adam, {"amsgrad": True}), (th.optim.AdamW, {})])
+def test_another_optimizer_is_used(optimizer, kwargs):
+    fitters = pair()
+    for fitter in fitters:
+        run(fitter, 5)
+        fitter.critic.optimizer = optimizer(fitter.critic.parameters(), lr=1e-2, **kwargs)
+        run(fitter, 20, first=5)
+    for a, b in zip(fitters[0].critic.parameters(), fitters[1].critic.parameters(), strict=True):
+        th.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_weights_from_a_vector():
+    """SB3's load_from_vector gives parameters other memory."""
+    fitters = pair()
+    for fitter in fitters:
+        run(fitter, 5)
+        vector = nn.utils.parameters_to_vector(fitter.critic.parameters())
+        nn.utils.vector_to_parameters(vector, fitter.critic_target.parameters())
+        run(fitter, 5, first=5)
+        nn.utils.vector_to_parameters(0.5 * vector, fitter.critic.parameters())
+        run(fitter, 5, first=10)
+    assert_equal_states(*fitters)
+
+
+@pytest.mark.parametrize("engine", ["autograd", "fused"])
+def test_another_policy_is_trained(small, algorithm, engine):
+    """As SB3's own algorithms do once their aliases are made again."""
+    model = small(algorithm, policy_kwargs=dict(critic_engine=engine)).learn(30)
+    model.policy = model.policy_class(model.observation_space, model.action_space, model.lr_schedule, **model.policy_kwargs)
+    model._create_aliases()
+    before = copy.deepcopy(model.policy.state_dict())
+    model.learn(40, reset_num_timesteps=False)
+    assert not any(th.equal(value, before[name]) for name, value in model.policy.state_dict().items())
+
+
+@pytest.mark.parametrize("activation_fn", [nn.ReLU, nn.Tanh, nn.ELU])
+def test_a_trained_model_is_pickled(make, activation_fn):
+    model = make(policy_kwargs=dict(activation_fn=activation_fn)).learn(40)
+    pickled = pickle.dumps(model.policy), pickle.dumps(model)
+    assert len(pickled[1]) < 400_000  # no workspaces, but a replay buffer
+    cloudpickle.dumps(model)
+    copies = [model, pickle.loads(pickled[1])]
+    for each in copies:
+        th.manual_seed(0)
+        np.random.seed(0)
+        each.train(3, 16)
+    for a, b in zip(*(each.policy.parameters() for each in copies), strict=True):
+        assert th.equal(a, b)
 
 
 # State of the optimiser -----------------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ class _StepsReplayBuffer(NStepReplayBuffer):
     ) -> None:
         check_number("n_steps", n_steps, 1, integer=True)
         check_number("gamma", gamma, 0, 1)
-        super().__init__(*args, n_steps=n_steps, gamma=gamma, **kwargs)
+        super().__init__(*args, n_steps=n_steps, gamma=float(gamma), **kwargs)  # NumPy's would be in double precision
         self.mirror = None if mirror is None else Mirror(mirror, self.observation_space, self.action_space)
 
     def add(

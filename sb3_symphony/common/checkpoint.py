@@ -261,7 +261,7 @@ class ExactCheckpoints(BaseCallback):
         self.finished = False  # whether learn() came to its end, with everything learned that was experienced
         self._rollout_ended = False
         self._latest = 0 if checkpoint is None else checkpoint.steps
-        # Of another agent, which the run began with
+        # Rows of the buffer beyond those of the counted steps: of another agent, or of an earlier training
         self._rows_before = 0 if checkpoint is None else checkpoint.state.get("rows before", 0)
         self.segments = ReplaySegments(self.folder, [] if checkpoint is None else checkpoint.state["segments"])
         self._segments_of: dict[int, set[str]] = {}  # steps of a checkpoint -> files that it needs
@@ -273,8 +273,10 @@ class ExactCheckpoints(BaseCallback):
         return self._restoring is None
 
     def _init_callback(self) -> None:
-        if self._restoring is None and self._buffer is not None:
-            self._rows_before = self._buffer.size()
+        buffer = self._buffer
+        if self._restoring is None and buffer is not None:  # that of an earlier training may have rows, and the count go on
+            rows = buffer.pos + buffer.buffer_size * buffer.full
+            self._rows_before = rows - self.model.num_timesteps // self.model.n_envs
 
     def _on_rollout_start(self) -> None:
         if self._restoring is not None:

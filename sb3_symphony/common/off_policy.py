@@ -5,7 +5,7 @@ import io
 import math
 import pathlib
 import warnings
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from typing import Any, ClassVar, TypeVar
 
@@ -37,6 +37,15 @@ SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
 FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
+
+
+#: log key (without ``train/``) to tensors of one shape, one for each of the latest updates of a ``train()`` call
+UpdateLogs = defaultdict[str, deque[th.Tensor]]
+
+
+def update_logs() -> UpdateLogs:
+    """:return: empty logs, of at most 1 000 updates: those of a long call, on recorded data, would fill the memory"""
+    return defaultdict(lambda: deque(maxlen=1000))
 
 
 class ActsGreedily(OffPolicyAlgorithm):
@@ -136,6 +145,9 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             self.batch_size = int(self.batch_size)
         check_number("tau", self.tau, 0, 1)
         check_number("gamma", self.gamma, 0, 1)
+        self.tau, self.gamma = float(self.tau), float(self.gamma)  # powers of NumPy's would be in double precision
+        if not np.issubdtype(self.action_space.dtype, np.floating):
+            raise ValueError(f"action_space={self.action_space}: expected real numbers, scaled ones are not whole")
         if not isinstance(self.train_freq, TrainFreq):
             frequency = self.train_freq[0] if isinstance(self.train_freq, tuple) else self.train_freq
             check_number("train_freq", frequency, 1, integer=True)
@@ -207,7 +219,6 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         super()._setup_model()
         self.n_steps, self.replay_buffer_class, self.replay_buffer_kwargs = n_steps, given_class, given
         self._create_aliases()
-        self._create_regression()
         self._was_set_up = True
 
     def _create_regression(self) -> None:
@@ -225,6 +236,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self.actor = self.policy.actor
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
+        self._create_regression()  # of these critics
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         assert self.env is not None, "You must set the environment before calling learn()"
@@ -292,7 +304,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
                 start += length
             gradient_steps -= draw
 
-    def _fit_critics(self, batch: ReplayBufferSamples, target: th.Tensor, logs: dict[str, list[th.Tensor]]) -> None:
+    def _fit_critics(self, batch: ReplayBufferSamples, target: th.Tensor, logs: UpdateLogs) -> None:
         """
         One step of the critics, after which the targets move.
 
@@ -306,6 +318,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             # Priority of a transition: its error averaged over the critics. Samples of this buffer alone have indices
             self.replay_buffer.update_priorities(batch.indices, (target - q_values).abs().mean(dim=0))  # type: ignore[attr-defined]
         self._n_updates += 1
+        self._logged_updates += 1
         logs["critic_loss"].append(loss)
         logs["q_values"].append(q_values)
         logs["target_q_mean"].append(target)
@@ -322,7 +335,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         """Discount of the bootstrap value: ``gamma`` to the power of the steps summed in ``rewards``."""
         return self.gamma if batch.discounts is None else batch.discounts
 
-    def _log_update(self, logs: dict[str, list[th.Tensor]], noise_std: th.Tensor | float) -> None:
+    def _log_update(self, logs: UpdateLogs, noise_std: th.Tensor | float) -> None:
         """
         Record the mean of each quantity over the updates of one ``train()`` call: the only transfer off the device; and the
         ratio of updates to environment steps since the log was written.
@@ -333,7 +346,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         """
         means = {}
         for key, values in logs.items():
-            stacked = th.stack(values)
+            stacked = th.stack(list(values))
             if key == "q_values":
                 means["q_mean"], means["q_std"] = stacked.mean(), stacked.std(dim=1, correction=0).mean()
             else:
@@ -347,7 +360,6 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         # Steps of the warm-up have no updates
         self._logged_transitions += max(1, self.num_timesteps - max(self._timesteps_at_update, self.learning_starts))
         self._timesteps_at_update = self.num_timesteps
-        self._logged_updates += len(logs["critic_loss"])
         self.logger.record("train/update_ratio", self._logged_updates / self._logged_transitions)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 

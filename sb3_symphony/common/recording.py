@@ -9,6 +9,7 @@ import pickle
 import time
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
+from enum import Enum
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 
 _NOT_WRAPPER_STATE = {"env", "_action_space", "_observation_space", "_metadata", "_cached_spec", "_saved_kwargs", "spec"}
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, tuple, frozenset, Enum)  # one object by chance
 _MONITOR_STATE = (
     "rewards",
     "needs_reset",
@@ -64,6 +66,7 @@ class RecordedEpisode(gym.Wrapper):
         super().__init__(env)
         self.start: dict[str, Any] = {}
         self.actions: list[Any] = []
+        self.rewards: list[Any] = []
         self.observation: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -76,7 +79,7 @@ class RecordedEpisode(gym.Wrapper):
         if seed is not None:
             generators.pop("env._np_random", None)  # which is about to be replaced
         self.start = {"generators": generators, "seed": seed, "options": options, "wrappers": self._wrappers()}
-        self.actions = []
+        self.actions, self.rewards = [], []
         self.observation, info = self.env.reset(seed=seed, options=options)
         self.start["observation"] = deepcopy(self.observation)  # some environments write the next one into it
         return self.observation, info
@@ -89,6 +92,7 @@ class RecordedEpisode(gym.Wrapper):
         self.actions.append(np.array(action))
         result = self.env.step(action)
         self.observation = result[0]
+        self.rewards.append(result[1])
         return result
 
     def recorded_state(self) -> dict[str, Any]:
@@ -96,6 +100,7 @@ class RecordedEpisode(gym.Wrapper):
         return {
             "start": self.start,
             "actions": np.array(self.actions),
+            "rewards": np.array(self.rewards),
             "observation": self.observation,
             "generators": self._generator_states(),
             "wrappers": self._wrappers(),
@@ -124,6 +129,8 @@ class RecordedEpisode(gym.Wrapper):
                 _, _, terminated, truncated, _ = self.step(action)
                 if terminated or truncated or self.monitor.rewards[-1] != reward:
                     return False
+            if not _same_bits(self.rewards, state.get("rewards", self.rewards)):  # as wrappers around the monitor see them
+                return False
         finally:
             self.monitor.results_writer = writer
             self._set_monitor(state)
@@ -168,19 +175,37 @@ class RecordedEpisode(gym.Wrapper):
 
     def _wrappers(self) -> list[dict[str, bytes]]:
         return [
-            {name: pickled for name, value in vars(wrapper).items() if (pickled := _pickled(name, value)) is not None}
+            {name: pickled for name, value in self._own(wrapper) if (pickled := _pickled(value)) is not None}
             for wrapper in self._inner_wrappers()
         ]
 
     def _set_wrappers(self, states: list[dict[str, bytes]]) -> None:
         for wrapper, state in zip(self._inner_wrappers(), states, strict=True):
-            for name, value in state.items():
-                setattr(wrapper, name, pickle.loads(value))
+            own = dict(self._own(wrapper))
+            for name, pickled in state.items():
+                value = pickle.loads(pickled)
+                if name not in own and name in vars(wrapper):
+                    continue
+                if _fit_each_other(own.get(name), value):
+                    own[name][...] = value  # it may be a view of the simulator's memory
+                else:
+                    setattr(wrapper, name, value)
+
+    def _own(self, wrapper: gym.Wrapper) -> Iterator[tuple[str, Any]]:
+        """Attributes of a wrapper that may be its state: no part of the environment inside, which has its own."""
+        inside = {id(value) for value in vars(self.unwrapped).values() if not isinstance(value, _PLAIN)}
+        for name, value in vars(wrapper).items():
+            other = name in _NOT_WRAPPER_STATE or callable(value) or isinstance(value, gym.Env | gym.Space)
+            if not other and id(value) not in inside:
+                yield name, value
 
 
-def _pickled(name: str, value: Any) -> bytes | None:
-    if name in _NOT_WRAPPER_STATE or callable(value) or isinstance(value, gym.Env | gym.Space):
-        return None
+def _fit_each_other(current: Any, value: Any) -> bool:
+    arrays = isinstance(current, np.ndarray) and isinstance(value, np.ndarray) and current.flags.writeable
+    return arrays and (current.shape, current.dtype) == (value.shape, value.dtype)
+
+
+def _pickled(value: Any) -> bytes | None:
     try:
         return pickle.dumps(value)
     except (pickle.PicklingError, TypeError, AttributeError):

@@ -172,9 +172,15 @@ class FusedRegression(CriticRegression):
     ) -> None:
         super().__init__(critic, critic_target, loss, reduction)
         self.bfloat16 = bfloat16
+        self._optimizer = critic.optimizer  # that these passes stand in for
+        self._parameters, self._targets = (list(each.q_networks.parameters()) for each in (critic, critic_target))
         self._networks: dict[EnsembleCritic, list[FusedNetwork]] = {}
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
-        self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])  # and addresses of the optimiser's state, both in them
+        # Network, addresses of the optimiser's state and of the targets, all of them in the sweeps
+        self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_networks": {}, "_sweeps": [], "_swept": (None, [])}  # made again at the next call
 
     def fit(
         self,
@@ -184,8 +190,8 @@ class FusedRegression(CriticRegression):
         tau: float,
         weights: th.Tensor | None = None,
     ) -> Fit:
-        if not all(parameter.requires_grad for parameter in self.critic.q_networks.parameters()):
-            return super().fit(observations, actions, target, tau, weights)  # which leaves frozen layers as they are
+        if self._customised():
+            return super().fit(observations, actions, target, tau, weights)
         with th.no_grad():
             network = self._network(self.critic, len(actions))
             features = self.critic.extract_features(observations, self.critic.features_extractor)
@@ -207,6 +213,18 @@ class FusedRegression(CriticRegression):
             outputs = self._network(self.critic_target, len(actions)).forward(features, actions, members)
             return self.objective.values(outputs)
 
+    def _customised(self) -> bool:
+        """Whether layers are frozen, there are hooks (to clip gradients), or the optimiser is another: autograd's business."""
+        optimizer = self.critic.optimizer
+        if optimizer is not self._optimizer:
+            if not_fusable(self.critic) is not None:
+                return True
+            self._optimizer = optimizer
+        hooks = optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks
+        return bool(hooks) or any(
+            not each.requires_grad or each._backward_hooks or each._post_accumulate_grad_hooks for each in self._parameters
+        )
+
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
         known = self._networks.get(critic, [])
         for network in known:
@@ -224,12 +242,11 @@ class FusedRegression(CriticRegression):
             if not state:  # as Adam itself does at a parameter's first step
                 state["step"] = th.zeros((), dtype=th.float32)
                 state.update(exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter))
-        swept, addresses = self._swept[0], [state["exp_avg"].data_ptr() for state in states]
-        if network is not swept or addresses != self._swept[1]:  # the batch size changed, or a state was loaded
+        addresses = [state["exp_avg"].data_ptr() for state in states] + [target.data_ptr() for target in self._targets]
+        if network is not self._swept[0] or addresses != self._swept[1]:  # another batch size; what was loaded lies elsewhere
             self._swept = (network, addresses)
             self._sweeps = []
-            targets = self.critic_target.q_networks.parameters()
-            for parameter, grad, state, target in zip(network.parameters, network.grads, states, targets, strict=True):
+            for parameter, grad, state, target in zip(network.parameters, network.grads, states, self._targets, strict=True):
                 tensors = (parameter, grad, state["exp_avg"], state["exp_avg_sq"], state["step"], target)
                 self._sweeps.append(partial(adam_polyak, *(array(tensor).reshape(-1) for tensor in tensors)))
 

@@ -160,6 +160,7 @@ def add_transitions(buffer: ReplayBuffer, parts: Iterable[dict[str, np.ndarray]]
     return count
 
 
+_MAY_CHANGE = {"beta"}  # of PrioritizedReplayBuffer: arguments that callbacks set while training
 _NOT_BUFFER_STATE = {*_STORAGE, "env", "device", "observation_space", "action_space"}
 
 
@@ -188,7 +189,7 @@ def restore_buffer(buffer: ReplayBuffer, state: dict[str, Any], segments: Replay
     """
     if state["attributes"].keys() != buffer_state(buffer)["attributes"].keys():
         raise ValueError(f"its replay buffer is no {type(buffer).__name__}")
-    for name in sorted(constructor_parameters(type(buffer)).keys() & state["attributes"].keys()):
+    for name in sorted((constructor_parameters(type(buffer)).keys() & state["attributes"].keys()) - _MAY_CHANGE):
         stored, own = state["attributes"][name], vars(buffer)[name]
         if isinstance(stored, bool | int | float | str | None) and stored != own:
             raise ValueError(f"{name} of its replay buffer is {stored!r}, not {own!r}")

@@ -1,4 +1,3 @@
-from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -12,7 +11,7 @@ from stable_baselines3.sac.policies import Actor
 
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.ensembles import combine
-from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm
+from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm, UpdateLogs, update_logs
 from sb3_symphony.redq.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, REDQPolicy
 
 SelfREDQ = TypeVar("SelfREDQ", bound="REDQ")
@@ -216,7 +215,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
-        logs: dict[str, list[th.Tensor]] = defaultdict(list)
+        logs = update_logs()
 
         # The actor and the temperature are frozen inside a segment: one forward pass gives all its next actions
         for segment, batches in self._segments(gradient_steps, batch_size):
@@ -245,7 +244,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             if hasattr(action_dist, name):
                 setattr(action_dist, name, None)  # they hold the last graph, and a policy with one cannot be copied
 
-    def _update_actor(self, batch: ReplayBufferSamples, ent_coef: th.Tensor, logs: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ReplayBufferSamples, ent_coef: th.Tensor, logs: UpdateLogs) -> None:
         """One step of the actor toward the mean of all critics, then one of the entropy coefficient."""
         if self.use_sde:
             self.actor.reset_noise()

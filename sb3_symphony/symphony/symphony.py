@@ -1,5 +1,4 @@
 import zlib
-from collections import defaultdict
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -18,7 +17,7 @@ from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
 from sb3_symphony.common.moving import Moving, at_step, check_moving
 from sb3_symphony.common.noise import DecayingNormalActionNoise
-from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, noise_std
+from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, UpdateLogs, noise_std, update_logs
 from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
 
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
@@ -219,7 +218,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         stored = self.replay_buffer.size() * self.n_envs
         batch_size = batch_size or min(max(stored // 500, 128), 1024)
 
-        logs: dict[str, list[th.Tensor]] = defaultdict(list)
+        logs = update_logs()
         if self._n_updates == 0:
             uniform, faded = self.initial_gradient_steps
             fades = isinstance(self.replay_buffer, FADING_BUFFERS)
@@ -233,7 +232,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         """Weights of the minimum, in the target and for the actor, at the present step."""
         self.target_mix, self.actor_mix = (at_step(each, self.num_timesteps) for each in _pair(self.min_mix))
 
-    def _update(self, gradient_steps: int, batch_size: int, logs: dict[str, list[th.Tensor]], **sample_kwargs: Any) -> None:
+    def _update(self, gradient_steps: int, batch_size: int, logs: UpdateLogs, **sample_kwargs: Any) -> None:
         # The actor is frozen inside a segment: one forward pass gives all its next actions
         for segment, batches in self._segments(gradient_steps, batch_size, **sample_kwargs):
             with th.no_grad():
@@ -257,7 +256,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
                 self._update_actor(batches[-1], logs)
                 self.policy.average_actor()
 
-    def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ReplayBufferSamples, logs: UpdateLogs) -> None:
         """One step of the actor toward the combined critics."""
         before_tanh = self.actor.before_tanh(batch.observations)  # (batch, n_actions)
         q_values = self._regression.q_values(batch.observations, th.tanh(before_tanh))

@@ -21,6 +21,7 @@ from torch import nn
 from sb3_symphony.common.ensembles import EnsembleCritic, combine
 from sb3_symphony.common.layers import LeakySine
 from sb3_symphony.common.losses import rehae, rehe
+from sb3_symphony.common.off_policy import UpdateLogs
 from sb3_symphony.symphony import Symphony
 from sb3_symphony.symphony.policies import SymphonyPolicy
 
@@ -70,7 +71,7 @@ class SymphonyV2(Symphony):
             following = self.policy.variance_target(batch.next_observations, self.actor(batch.next_observations))[0]
             return SCALE * (SCALE * batch.rewards.var() + (1 - batch.dones) * self._discounts(batch) * following)
 
-    def _update_actor(self, batch: ReplayBufferSamples, logs: dict[str, list[th.Tensor]]) -> None:
+    def _update_actor(self, batch: ReplayBufferSamples, logs: UpdateLogs) -> None:
         variance: EnsembleCritic = self.policy.variance
         # As the critics: a step toward the target, then the target's own
         loss = rehe(self.variance_of_target(batch) - variance(batch.observations, batch.actions)).sum()
