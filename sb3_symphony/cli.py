@@ -561,6 +561,8 @@ def _add_list(commands: Any) -> None:
 def _list(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     if arguments["algo"]:
         check_algorithm(arguments["algo"])
+        if arguments["algo"] not in ALGORITHMS:
+            raise ConfigError(f"--algo: '{arguments['algo']}' — expected one of {', '.join(ALGORITHMS)}, which have settings")
     names = [arguments["algo"]] if arguments["algo"] else list(ALGORITHMS)
     print("\n".join(f"{name:10}{ALGORITHMS[name][2]}\n{'':10}{', '.join(shipped_environments(name))}" for name in names))
     return 0

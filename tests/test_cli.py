@@ -219,6 +219,11 @@ def test_output_that_has_no_such_characters():
     assert done.returncode == 0 and done.stderr == b"" and b"?" in done.stdout
 
 
+def test_settings_of_an_algorithm_in_a_file(folder, capsys):
+    (folder / "own.py").touch()
+    assert "--algo: 'own.py:X' — expected one of symphony" in fails(capsys, "list", "--algo", "own.py:X")
+
+
 def test_unknown_command(capsys):
     assert "did you mean 'train'" in fails(capsys, "trian")
     assert "required" in fails(capsys)

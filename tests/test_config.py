@@ -19,6 +19,7 @@ from sb3_symphony.experiment.config import (
     ConfigError,
     RunConfig,
     TrainOptions,
+    find_entry,
     load_config,
     parse_expression,
     parse_pairs,
@@ -354,6 +355,27 @@ def test_a_number_may_be_text_but_nothing_else(value):
     else:
         with pytest.raises(ConfigError):
             decode(learning_rate=value)
+
+
+@pytest.mark.parametrize("env", ["Pendulum-v1", "gymnasium:Pendulum-v1"])
+def test_the_module_of_an_environment_is_no_part_of_its_name(tmp_path, monkeypatch, env):
+    monkeypatch.chdir(tmp_path)
+    assert find_entry(TrainOptions(algo="sac", env=env))[0] == "sac.yml, Pendulum-v1"
+    (tmp_path / "own.yml").write_text("Pendulum-v1: {n_timesteps: 1}\ngymnasium:Pendulum-v1: {n_timesteps: 2}\n")
+    entry = find_entry(TrainOptions(algo="sac", env=env, conf_file="own.yml"))[1]
+    assert entry == {"n_timesteps": 2 if ":" in env else 1}
+
+
+@pytest.mark.parametrize("text", ["a: 1\nb: 2\na: 3", "x: {a: 1, a: 1}", "- {a: 1}\n- {1: a, 1: b}"])
+def test_keys_twice_are_refused(text):
+    with pytest.raises(ConfigError, match="is there twice"):
+        parse_yaml(text, "here")
+
+
+def test_merged_keys_may_be_changed():
+    text = "a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3, '1': 5, 1: 6}\nc: {<<: *a, x: 4}"
+    content = parse_yaml(text, "here")
+    assert content["b"] == {"x": 1, "y": 3, "1": 5, 1: 6} and content["c"] == {"x": 4, "y": 2}
 
 
 def test_misspelt_presets_and_keys(tmp_path, monkeypatch):

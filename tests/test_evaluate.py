@@ -56,6 +56,12 @@ def walker():
     return {"model": "walker.zip", "algo": "sac", "env": "BipedalWalker-v3", "env_kwargs": SHORT}
 
 
+def test_wrappers_for_training_only_are_refused(walker):
+    scale = [("sb3_symphony.common.wrappers.RewardScale", {"scale": 0.1})]
+    with pytest.raises(ConfigError, match=r"--env-wrapper: '.*RewardScale' — is for training only"):
+        evaluate(EvaluateOptions(**walker, n_episodes=1, env_wrapper=scale))
+
+
 @pytest.fixture
 def pendulum():
     model = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs={"net_arch": [8]}, seed=0, device="cpu")

@@ -125,6 +125,45 @@ def test_images():
     assert run_onnx(onnx_model(model, None), images) == pytest.approx(model.predict(images, deterministic=True)[0], abs=1e-5)
 
 
+class LastChannels(gym.Env):
+    observation_space = gym.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+    action_space = gym.spaces.Box(-1, 1, (2,))
+
+    def observe(self):
+        return self.np_random.integers(0, 256, (36, 40, 3), dtype=np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.observe(), {}
+
+    def step(self, action):
+        self.steps += 1
+        return self.observe(), 1.0, False, self.steps == 100, {}
+
+
+if "LastChannels-v0" not in gym.registry:
+    gym.register("LastChannels-v0", entry_point=LastChannels)
+
+
+@pytest.mark.parametrize("normalize", ["false", "{norm_obs: false}"])
+@pytest.mark.parametrize("frame_stack", [[], ["frame_stack:2"]])
+def test_images_with_their_channels_last(folder, capsys, normalize, frame_stack):
+    """The file takes them as the environment gives them."""
+    small = ["policy:CnnPolicy", "n_steps:32", "batch_size:32", "n_epochs:1", f"normalize:{normalize}", *frame_stack]
+    argv = "train --algo ppo --env LastChannels-v0 -n 32 --eval-freq 0 --seed 0 --device cpu --quiet -params"
+    assert main([*argv.split(), *small]) == 0
+    assert main("export --algo ppo --env LastChannels-v0 -o images.onnx".split()) == 0
+    assert "equal to predict on 1000 observations" in capsys.readouterr().out
+    channels = 6 if frame_stack else 3
+    image = np.random.default_rng(0).integers(0, 256, (1, 36, 40, channels), dtype=np.uint8)
+    given = run_onnx((folder / "images.onnx").read_bytes(), image)
+    model = PPO.load("logs/ppo/LastChannels-v0_1/LastChannels-v0.zip")
+    assert given == pytest.approx(model.predict(np.moveaxis(image, -1, 1), deterministic=True)[0], abs=1e-5)
+    properties = {item.key: item.value for item in onnx.load("images.onnx").metadata_props}
+    assert f"(36, 40, {channels})" in properties["observation_space"]
+
+
 def test_command(folder, capsys):
     env = VecNormalize(make_vec_env("Unequal-v0", seed=0))
     PPO("MlpPolicy", env, n_steps=64, batch_size=64, seed=0, device="cpu").learn(128).save("ppo")

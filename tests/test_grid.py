@@ -200,6 +200,11 @@ def test_quick_and_then_longer(folder, capsys):
     result = json.loads((results / "td3" / "Pendulum-v1_0" / "result.json").read_text())
     assert result["steps"] == 300 and len(result["final"]["returns"]) == 1
     assert "resumed at 220" in (results / "td3" / "Pendulum-v1_0.log").read_text()
+    shutil.rmtree(results / "td3" / "Pendulum-v1_0" / "checkpoints")  # as one may, of cells that are done
+    assert main(["bench", str(write_study(folder, quick={**quick, "final_episodes": 2})), "--quick"]) == 0
+    again = json.loads((results / "td3" / "Pendulum-v1_0" / "result.json").read_text())
+    assert len(again["final"]["returns"]) == 2 and again["seconds"] == result["seconds"]
+    quick = {**quick, "final_episodes": 2}
     capsys.readouterr()
     before = contents(results)
     message = fails(capsys, "bench", str(write_study(folder, quick={**quick, "steps": 250})), "--quick")
@@ -488,6 +493,15 @@ def test_a_worker_of_loky_that_dies_is_replaced(folder, die_once):
                 }
             },
             "td3 on Pendulum-v1: condition '2': the model does not fit Pendulum-v1: observation space of the model",
+        ),
+        (
+            {
+                "matrix": {
+                    "label": "s",
+                    "conditions": {2: {"env_wrapper": {"sb3_symphony.common.wrappers.RewardScale": {"scale": 2.0}}}},
+                }
+            },
+            "condition '2': env_wrapper: 'sb3_symphony.common.wrappers.RewardScale' — is for training only",
         ),
         ({"sead": 3}, "unknown option 'sead': did you mean 'seeds'?"),
     ],

@@ -240,6 +240,29 @@ def test_more_steps_of_an_agent_that_another_began_with(study, tmp_path, fails):
         fails(["bench", str(tmp_path / "study.yml"), "-f", str(study / "results"), *flags], message)
 
 
+@pytest.mark.parametrize(
+    "source, onward, message",
+    [
+        ({"algo": "ppo", "overrides": {"n_steps": 50}}, {"replay_buffer": True}, "--with-replay-buffer: PPO has no"),
+        ({"algo": "td3", "overrides": SMALL}, {"net_arch": [9]}, "networks of first/Pendulum-v1_3 (policy_kwargs"),
+        ({"algo": "td3", "overrides": SMALL}, {"n_envs": 2, "replay_buffer": True}, "start_from: replay_buffer: first/"),
+        ({"algo": "td3", "overrides": SMALL}, {"normalize": True}, "has no statistics of VecNormalize"),
+        ({"algo": "td3", "overrides": SMALL}, {"frame_stack": 2}, "first/Pendulum-v1_3 does not fit the environment"),
+    ],
+)
+def test_agents_that_nothing_can_start_from(tmp_path, fails, source, onward, message):
+    """Which shows before anything is trained."""
+    start = {"algorithm": "first", "environment": "Pendulum-v1", "replay_buffer": onward.pop("replay_buffer", False)}
+    kwargs = {"policy_kwargs": {"net_arch": onward.pop("net_arch")}} if "net_arch" in onward else {}
+    second = {"algo": source["algo"], "overrides": {**source["overrides"], **onward, **kwargs}, "start_from": start}
+    algorithms = [{"name": "first", **source}, {"name": "second", **second}]
+    study = {"algorithms": algorithms, "environments": ["Pendulum-v1"], "seeds": [3], "steps": 200}
+    (tmp_path / "study.yml").write_text(yaml.safe_dump(study))
+    for flags in (["--dry-run"], []):
+        fails(["bench", str(tmp_path / "study.yml"), "-f", str(tmp_path / "results"), *flags], message)
+    assert not (tmp_path / "results").exists()
+
+
 def test_another_condition_of_the_same_name(study, tmp_path, fails):
     matrix = copy.deepcopy(STUDY["matrix"])
     matrix["conditions"][20]["obs_noise"] = 50

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from matplotlib import image
 from matplotlib.colors import to_hex
+from matplotlib.text import Text
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis import plots
@@ -221,6 +222,11 @@ def test_images(logs):
     assert pixels.shape[1] >= 1400 and pixels[..., :3].std() > 0.05
 
 
+def test_names_are_no_formulas(logs, figures):
+    assert main(["plot", "-a", "sac", "-l", "cost $x_$ and ^$"]) == 0
+    assert "cost $x_$ and ^$" in {text.get_text() for text in figures[0].findobj(Text)}
+
+
 def test_nothing_is_cut_off(logs, figures):
     assert main(["plot", "-l", "a rather long name of a curve", "another name", "-e", "X-v0"]) == 0
     figure = figures[0]
@@ -268,6 +274,9 @@ def test_a_run_without_episodes_has_a_figure_too(tmp_path, figures):
         ("logs/sac/X-v0_9", "logs/sac/X-v0_9: no such folder"),
         ("logs/sac/X-v0_1 -a sac", "expected run folders, or -a and -e to look for runs, not both"),
         ("--scalars --evaluations", "expected only one of them"),
+        ("logs/sac/X-v0_1 -f logs", "expected run folders, or -f to look for runs, not both"),
+        ("-w 5 --mean-per 10", "-w: 5 — is for running means of training episodes, not for --mean-per"),
+        ("-w 5 --evaluations", "-w: 5 — is for running means of training episodes, not for --evaluations"),
         ("--scalars -y length", "-y: length — is for episodes"),
         ("--evaluations --mean-per 10", "--mean-per: 10 — is for training episodes"),
         ("--scalars -a td3", "logs/td3/X-v0_1: no TensorBoard log is known"),

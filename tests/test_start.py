@@ -438,12 +438,36 @@ def test_wrapper_of_the_vectorised_environment():
             train(options(hyperparams={**SMALL, "vec_env_wrapper": bad}))
 
 
+class Goal(gym.Env):
+    def __init__(self, limit=1.0, key="place"):
+        self.observation_space = gym.spaces.Dict({key: gym.spaces.Box(-1, 1, (2,))})
+        self.action_space = gym.spaces.Box(-limit, limit, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+
+if "Goal-v0" not in gym.registry:
+    gym.register("Goal-v0", entry_point=Goal)
+
+
+@pytest.mark.parametrize("limit, key", [(1.0, "other"), (2.0, "place")])
+def test_spaces_of_evaluations(limit, key):
+    """Dict observations with another key, actions with another limit."""
+    dicts = {"hyperparams": {**SMALL, "policy": "MultiInputPolicy"}, "env": "Goal-v0"}
+    with pytest.raises(ConfigError, match=r"--eval-env-kwargs: (observation|action)_space .* — that of the training is"):
+        train(options(eval_freq=60, eval_env_kwargs={"limit": limit, "key": key}, **dicts))
+
+
 def test_stop_reward(capsys):
     small = {**SMALL, "stop_reward": -1900.0}  # any agent is better
     result = train(options(n_timesteps=5000, hyperparams=small, eval_freq=60, save_freq=50))
     assert result.steps == 60 and not result.interrupted and result.run.model.exists()
     again = train(TrainOptions(resume=str(result.run.path)))
     assert again.untouched  # it is done
+    more = train(TrainOptions(resume=str(result.run.path), n_timesteps=6000)).summary()
+    assert more.endswith("is finished: 60 steps, its stop_reward reached — nothing changed")
     never = train(options(hyperparams={**SMALL, "stop_reward": 0.0}, eval_freq=60))
     assert never.steps == 120
     with pytest.raises(ConfigError, match="stop_reward: 0 — needs evaluations"):

@@ -258,6 +258,10 @@ def test_algorithms_of_a_file(write, tmp_path):
             },
             "b: start_from: td3 is of algorithm 'td3' — expected 'ddpg'",
         ),
+        (
+            {"final_episodes": 0, "matrix": {"label": "x", "conditions": {"a": {}}}},
+            "final_episodes: 0 — expected 1 or more for the conditions of the matrix",
+        ),
         ({"final_episodes": True}, "final_episodes: True — expected a whole number"),
     ],
 )

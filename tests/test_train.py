@@ -12,11 +12,13 @@ import yaml
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_symphony.analysis.runs import find_runs, group_runs
 from sb3_symphony.cli import main
 from sb3_symphony.common.wrappers import FreshBox2DWorld
 from sb3_symphony.experiment.config import RunSettings, TrainOptions, load_config
 from sb3_symphony.experiment.environment import EpisodeSeeds, make_evaluation_env, make_training_env
 from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.select import SelectOptions, select_model
 from sb3_symphony.experiment.train import train
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
@@ -37,6 +39,25 @@ def options(algo="td3", env="Pendulum-v1", n_timesteps=250, **changes):
 
 def monitor_returns(run):
     return np.loadtxt(run.path / "0.monitor.csv", delimiter=",", skiprows=2, ndmin=2)[:, 0]
+
+
+def test_a_picture_that_fails_costs_no_model(folder, capsys, monkeypatch):
+    def broken(path):
+        raise RuntimeError("no fonts")
+
+    monkeypatch.setattr("sb3_symphony.experiment.train.plot_training", broken)
+    run = train(options()).run
+    assert TD3.load(run.model).num_timesteps == 250
+    assert "note: training.png was not drawn — RuntimeError: no fonts" in capsys.readouterr().err
+
+
+def test_a_run_is_found_with_the_module_of_its_environment():
+    train(options(env_kwargs={"g": 5.0}, n_timesteps=60))
+    for env in ("Pendulum-v1", "gymnasium:Pendulum-v1"):
+        assert select_model(SelectOptions(algo="td3", env=env)).settings.env_kwargs == {"g": 5.0}
+    other = train(options(env="gymnasium:Pendulum-v1", env_kwargs={"g": 5.0}, n_timesteps=60, seed=2)).run
+    (group,) = group_runs(find_runs(other.path.parents[1], [], []))
+    assert group.env == "Pendulum-v1" and len(group.runs) == 2
 
 
 def test_run_folder(folder, capsys):

@@ -322,6 +322,7 @@ def test_nothing_is_written_for_a_mistake(played, options, tmp_path):
         ({"storage": "nonsense://x"}, "unknown kind of storage"),
         ({"conf_file": "nowhere.yml"}, "no such file"),
         ({"device": "cuda:x"}, "--device"),
+        ({"hyperparams": {"stop_reward": -1}}, "stop_reward: -1 — expected none"),
         ({"show": True}, "there is no sweep at logs"),
     ]:
         with pytest.raises(ConfigError, match=message):

@@ -261,7 +261,7 @@ def open_run(folder: Path) -> Run:
     return Run(
         folder,
         algo=str(options.get("algo", folder.absolute().parent.name)),
-        env=str(options.get("env", details.name)),
+        env=str(options.get("env", details.name)).rpartition(":")[2],  # with or without the module that registers it
         seed=options.get("seed"),
         config=config,
         log=noted_log(details / "tensorboard.txt"),

@@ -40,6 +40,7 @@ _STYLE: dict[Any, Any] = {
     "legend.fontsize": 8,
     "lines.linewidth": 1.8,
     "lines.solid_capstyle": "round",
+    "text.parse_math": False,  # names of files and variants may have a $
     "svg.hashsalt": "sb3-symphony",  # the same figure gives the same file
 }
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
@@ -23,8 +22,10 @@ from sb3_symphony.experiment.config import ConfigError, told
 from sb3_symphony.experiment.environment import (
     RunMonitor,
     Wrappers,
+    check_task_wrappers,
     import_packages,
     make_env,
+    same_space,
     split_wrappers,
     stacked,
     vec_wrapped,
@@ -114,6 +115,7 @@ def open_agent(
     """
     import_packages(options.gym_packages)
     check_device(options.device)
+    check_task_wrappers(options.env_wrapper, "--env-wrapper")
     selection = select_model(options)
     if options.num_threads > 0:
         th.set_num_threads(options.num_threads)
@@ -262,14 +264,6 @@ def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None
         print(f"note: {statistics} lies beside the model, --vecnormalize would use it", file=sys.stderr)
 
 
-def _fits(model: spaces.Space, env: spaces.Space, exact: bool) -> bool:
-    if isinstance(model, spaces.Dict) and isinstance(env, spaces.Dict):
-        return model.keys() == env.keys() and all(_fits(model[key], env[key], exact) for key in model)
-    if isinstance(model, spaces.Box) and isinstance(env, spaces.Box) and not exact:
-        return model.shape == env.shape and (model.dtype == np.uint8) == (env.dtype == np.uint8)
-    return model == env
-
-
 def check_match(model: BaseAlgorithm, env: VecEnv, selection: Selection) -> None:
     """
     :param model: a trained model
@@ -294,6 +288,6 @@ def check_spaces(model: BaseAlgorithm, env: VecEnv, name: str, env_id: str) -> N
         ("observation", model.observation_space, env.observation_space, False),
         ("action", model.action_space, env.action_space, True),
     ):
-        if not _fits(own, given, exact):
+        if not same_space(own, given, exact):
             both = f"{what} space of the model {own}, of the environment {given}"
             raise ConfigError(f"{name} does not fit {env_id}: {both}")

@@ -308,9 +308,12 @@ def _updates(model: Path) -> int:
 
 
 def _seconds(run: RunFolder) -> float:
-    """Wall-clock time of a run whose process ended before it could tell."""
+    """Wall-clock time of a run that had ended before: as it was told then, or else as its last checkpoint has it."""
     from sb3_symphony.common.checkpoint import newest_checkpoint
 
+    told = read_result(run.path)
+    if told is not None:
+        return float(told["seconds"])
     checkpoint = newest_checkpoint(run.checkpoints)
     assert checkpoint is not None  # a run is finished when it has its last one
     return checkpoint.state["elapsed"] / 1e9

@@ -20,7 +20,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
 from sb3_symphony.common.checks import suggestion
-from sb3_symphony.experiment.registry import ALGORITHMS, is_file
+from sb3_symphony.experiment.registry import ALGORITHMS, is_file, without_module
 
 
 class ConfigError(ValueError):
@@ -53,7 +53,16 @@ def reason(error: Exception) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.1 without objects, and with ``1e-3`` and ``1e6`` as numbers (PyYAML wants a dot in them)."""
+    """YAML 1.1 without objects or keys twice, and with ``1e-3`` and ``1e6`` as numbers (PyYAML wants a dot in them)."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
+                raise yaml.composer.ComposerError(None, None, f"'{key.value}' is there twice", key.start_mark)
+            seen.add((key.tag, key.value) if isinstance(key, yaml.ScalarNode) else id(key))
+        return node
 
 
 _Loader.add_implicit_resolver(
@@ -408,7 +417,7 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
         near = suggestion(path, presets) or f" — expected a YAML file or one of {', '.join(sorted(presets))}"
         raise ConfigError(f"-conf: no such file or preset '{path}'{near}")
     content = read_yaml(path)
-    for name in (options.env, "default"):
+    for name in (options.env, without_module(options.env), "default"):
         if name in content:
             if not isinstance(content[name], dict):
                 raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")

@@ -126,6 +126,17 @@ def split_wrappers(named: list[tuple[str, dict[str, Any]]]) -> tuple[Wrappers, W
     return task, training
 
 
+def check_task_wrappers(named: list[tuple[str, dict[str, Any]]], where: str) -> None:
+    """
+    :param named: wrappers for an evaluation, as a configuration has them
+    :param where: where they come from, for messages
+    :raises ConfigError: if one of them is for training only, where it changes what is learned
+    """
+    for name, _ in named:
+        if for_training_only(name):
+            raise ConfigError(f"{where}: '{name}' — is for training only; evaluations have the environment's own rewards")
+
+
 def _wrapped(env: gym.Env, wrappers: Wrappers) -> gym.Env:
     for wrapper in wrappers:
         try:
@@ -226,15 +237,29 @@ def check_spaces(env: VecEnv, env_id: str, algo: str, policy: str) -> None:
         raise ConfigError(f"policy: 'MultiInputPolicy' — needs Dict observations, {env_id} has {env.observation_space}")
 
 
+def same_space(ours: spaces.Space, theirs: spaces.Space, exact: bool) -> bool:
+    """
+    :param ours: a space
+    :param theirs: another one
+    :param exact: whether limits count
+    :return: whether they are the same
+    """
+    if isinstance(ours, spaces.Dict) and isinstance(theirs, spaces.Dict):
+        return ours.keys() == theirs.keys() and all(same_space(ours[key], theirs[key], exact) for key in ours)
+    if isinstance(ours, spaces.Box) and isinstance(theirs, spaces.Box) and not exact:
+        return ours.shape == theirs.shape and (ours.dtype == np.uint8) == (theirs.dtype == np.uint8)
+    return ours == theirs
+
+
 def check_same_spaces(training: VecEnv, evaluation: VecEnv) -> None:
     """
     :param training: environment that is learned from
     :param evaluation: environment for evaluations
-    :raises ConfigError: if their spaces differ in shape
+    :raises ConfigError: if their spaces differ; limits of observations may, as nothing uses them
     """
     for what in ("observation_space", "action_space"):
         ours, theirs = getattr(training, what), getattr(evaluation, what)
-        if type(ours) is not type(theirs) or ours.shape != theirs.shape:
+        if not same_space(ours, theirs, exact=what == "action_space"):
             raise ConfigError(f"--eval-env-kwargs: {what} {theirs} — that of the training is {ours}")
 
 

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
-from stable_baselines3.common.vec_env import VecNormalize, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, unwrap_vec_normalize, unwrap_vec_wrapper
 from torch import nn
 
 from sb3_symphony.experiment.agent import Agent, check_device, open_agent
@@ -31,6 +31,7 @@ class DeployedActor(nn.Module):
 
     :param policy: policy with continuous actions
     :param normalization: statistics of the observations, None without
+    :param transposes: whether observations are images with their channels last, which the policy wants first
     """
 
     low: th.Tensor
@@ -38,8 +39,9 @@ class DeployedActor(nn.Module):
     mean: th.Tensor
     std: th.Tensor
 
-    def __init__(self, policy: BasePolicy, normalization: VecNormalize | None) -> None:
+    def __init__(self, policy: BasePolicy, normalization: VecNormalize | None, transposes: bool = False) -> None:
         super().__init__()
+        self.transposes = transposes
         space = policy.action_space
         assert isinstance(space, spaces.Box)
         self.policy = policy
@@ -60,6 +62,8 @@ class DeployedActor(nn.Module):
         """
         if self.clip is not None:
             observation = ((observation - self.mean) / self.std).clip(-self.clip, self.clip).float()
+        if self.transposes:
+            observation = observation.permute(0, 3, 1, 2)
         action = self.policy._predict(observation, deterministic=True).reshape(-1, *self.low.shape)
         if self.policy.squash_output:
             return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
@@ -102,26 +106,33 @@ def export(options: ExportOptions) -> Export:
     with open_agent(options.model_copy(update={"device": "cpu"})) as agent:
         path = output_file(options.output or agent.selection.beside(".onnx"), "--output", (".onnx",))
         _check_exportable(agent)
-        content = onnx_model(agent.model, unwrap_vec_normalize(agent.env), _properties(agent))
+        content = onnx_model(agent.model, _normalization(agent), _properties(agent), _transposition(agent) is not None)
         difference = _difference(content, agent)
     write_output(path, content, "--output")
     return Export(path, difference)
 
 
-def onnx_model(model: BaseAlgorithm, normalization: VecNormalize | None, properties: dict[str, str] | None = None) -> bytes:
+def onnx_model(
+    model: BaseAlgorithm,
+    normalization: VecNormalize | None,
+    properties: dict[str, str] | None = None,
+    transposes: bool = False,
+) -> bytes:
     """
     :param model: model with an array observation and continuous actions, on the CPU
     :param normalization: statistics of the observations, None without
     :param properties: what the file is to say about itself
+    :param transposes: whether observations are images with their channels last, which the policy wants first
     :return: its actor in ONNX format
     """
     import onnx
 
     space = model.observation_space
     assert isinstance(space, spaces.Box)
-    actor = DeployedActor(model.policy, normalization).eval()
+    actor = DeployedActor(model.policy, normalization, transposes).eval()
     model.policy.set_training_mode(False)
-    example = th.as_tensor(np.zeros((1, *space.shape), dtype=space.dtype))
+    shape = (*space.shape[1:], space.shape[0]) if transposes else space.shape
+    example = th.as_tensor(np.zeros((1, *shape), dtype=space.dtype))
     batch = {0: "batch"}
     content = io.BytesIO()
     with th.no_grad(), warnings.catch_warnings():
@@ -141,6 +152,17 @@ def onnx_model(model: BaseAlgorithm, normalization: VecNormalize | None, propert
     return result.SerializeToString()
 
 
+def _transposition(agent: Agent) -> VecTransposeImage | None:
+    """What puts the channels of images first, None if the environment does or has no images."""
+    return unwrap_vec_wrapper(agent.env, VecTransposeImage)
+
+
+def _normalization(agent: Agent) -> VecNormalize | None:
+    """What normalises the observations; rewards alone do not concern an actor."""
+    normalization = unwrap_vec_normalize(agent.env)
+    return normalization if normalization is not None and normalization.norm_obs else None
+
+
 def _check_exportable(agent: Agent) -> None:
     selection, model = agent.selection, agent.model
     if not isinstance(model.action_space, spaces.Box):
@@ -149,30 +171,33 @@ def _check_exportable(agent: Agent) -> None:
         raise ConfigError(f"{selection.model}: its observations are {model.observation_space} — expected an array (Box)")
     if selection.algo == "ppo_lstm":
         raise ConfigError(f"{selection.model}: a recurrent policy keeps a state between steps — expected one without")
-    if selection.normalization is not None and selection.settings.frame_stack is not None:
+    if _normalization(agent) is not None and selection.settings.frame_stack is not None:
         raise ConfigError(f"{selection.model}: stacks normalised observations — expected no frame_stack, or no normalize")
 
 
 def _properties(agent: Agent) -> dict[str, str]:
+    transposition = _transposition(agent)
+    raw = agent.model.observation_space if transposition is None else transposition.venv.observation_space
     return {
         "algorithm": agent.selection.algo,
         "environment": agent.selection.env_id,
-        "observation_space": str(agent.model.observation_space),
+        "observation_space": str(raw),
         "action_space": str(agent.model.action_space),
     }
 
 
 def _raw_observations(agent: Agent) -> np.ndarray:
     """Observations of played episodes before normalisation, shape ``(N_OBSERVATIONS, *observation_shape)``."""
-    normalization = unwrap_vec_normalize(agent.env)
+    normalization, transposed = _normalization(agent), _transposition(agent) is not None
     found: list[np.ndarray] = []
     seed = 0
     while len(found) < N_OBSERVATIONS:
         for step in agent.episode(seed, deterministic=False):  # for variety
-            if normalization is None:
-                found.append(step.observation)
-            else:
+            if normalization is not None:
                 found.append(np.asarray(normalization.get_original_obs())[0])
+            else:
+                observation = np.asarray(step.observation)
+                found.append(np.moveaxis(observation, 0, -1) if transposed else observation)
         seed += 1
     return np.stack(found[:N_OBSERVATIONS])
 
@@ -181,8 +206,10 @@ def _difference(content: bytes, agent: Agent) -> float:
     import onnxruntime
 
     raw = _raw_observations(agent)
-    normalization = unwrap_vec_normalize(agent.env)
+    normalization = _normalization(agent)
     seen = raw if normalization is None else normalization.normalize_obs(raw)
+    if _transposition(agent) is not None:
+        seen = np.moveaxis(np.asarray(seen), -1, 1)
     expected, _ = agent.model.predict(seen, deterministic=True)
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     given = session.run(None, {"observation": raw})[0]

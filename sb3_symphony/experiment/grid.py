@@ -33,7 +33,7 @@ from sb3_symphony.experiment.grid_progress import Progress, standings
 from sb3_symphony.experiment.grid_report import collect, on_page, report
 from sb3_symphony.experiment.registry import is_file, without_folder
 from sb3_symphony.experiment.signals import handled_by
-from sb3_symphony.experiment.study import Cell, Study, found_by, read_study, sweep_options
+from sb3_symphony.experiment.study import Cell, Study, configuration, found_by, read_study, sweep_options
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -144,14 +144,21 @@ def _check_models(progress: Sequence[Progress]) -> None:
     """Build each model once: whatever is wrong with algorithms, environments or settings shows before anything runs."""
     from sb3_symphony.experiment.protocol import keep_protocol
     from sb3_symphony.experiment.train import build_model
+    from sb3_symphony.experiment.transfer import check_source
+
+    def model_of(cell: Cell) -> "BaseAlgorithm":
+        model = build_model(cell.options, configuration(cell), seed=0, verbose=0)
+        env = model.get_env()
+        assert env is not None
+        env.close()
+        return model
 
     for each in {(p.cell.algorithm, p.cell.environment.id): p for p in progress if not p.kept}.values():
         cell = each.cell
         try:
-            model = build_model(cell.options, each.config, seed=0, verbose=0)
-            env = model.get_env()
-            assert env is not None
-            env.close()
+            model = model_of(cell)
+            if cell.start_from is not None:
+                check_source(model, model_of(cell.start_from), cell.start_from.name, cell.options.with_replay_buffer)
             keep_protocol(cell.options, each.config)
             for name, condition in cell.conditions.items():
                 _check_condition(name, condition, cell, each.config, model)
@@ -161,10 +168,11 @@ def _check_models(progress: Sequence[Progress]) -> None:
 
 def _check_condition(name: str, condition: dict[str, Any], cell: Cell, config: RunConfig, model: "BaseAlgorithm") -> None:
     from sb3_symphony.experiment.agent import check_spaces
-    from sb3_symphony.experiment.environment import make_evaluation_env
+    from sb3_symphony.experiment.environment import check_task_wrappers, make_evaluation_env
 
     settings = config.settings.varied(condition["env_kwargs"], condition["env_wrapper"])
     try:
+        check_task_wrappers(condition["env_wrapper"], "env_wrapper")
         env = make_evaluation_env(cell.environment.id, settings)
         env.close()
         check_spaces(model, env, "the model", cell.environment.id)

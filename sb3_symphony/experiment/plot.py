@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.output import output_file, report
+from sb3_symphony.experiment.registry import without_module
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.plots import Curve, Line
@@ -88,10 +89,15 @@ def check_options(options: PlotOptions) -> None:
         raise ConfigError("--evaluations and --scalars: expected only one of them")
     if options.mean_per is not None and options.kind != "episodes":
         raise ConfigError(f"--mean-per: {options.mean_per} — is for training episodes, not for --{options.kind}")
+    if "episode_window" in options.model_fields_set and (options.mean_per is not None or options.kind != "episodes"):
+        other = "--mean-per" if options.mean_per is not None else f"--{options.kind}"
+        raise ConfigError(f"-w: {options.episode_window} — is for running means of training episodes, not for {other}")
     if options.y_axis != "reward" and options.kind == "scalars":
         raise ConfigError(f"-y: {options.y_axis} — is for episodes, not for --scalars")
     if options.runs and (options.algo or options.env):
         raise ConfigError(f"{options.runs[0]}: expected run folders, or -a and -e to look for runs, not both")
+    if options.runs and "folder" in options.model_fields_set:
+        raise ConfigError(f"{options.runs[0]}: expected run folders, or -f to look for runs, not both")
 
 
 def _groups(options: PlotOptions) -> "list[Group]":
@@ -102,10 +108,12 @@ def _groups(options: PlotOptions) -> "list[Group]":
         folders = {Path(folder).resolve(): Path(folder) for folder in options.runs}  # each once
         runs = [open_run(folder) for folder in folders.values()]
     else:
-        runs = find_runs(Path(options.folder), options.algo, options.env)
+        folder = Path(options.folder)
+        runs = find_runs(folder, options.algo, options.env)
+        envs = [without_module(env) for env in options.env]
         for flag, wanted, there in (
-            ("-a", options.algo, {run.algo for run in find_runs(Path(options.folder), [], [])}),
-            ("-e", options.env, {run.env for run in find_runs(Path(options.folder), options.algo, [])}),
+            ("-a", options.algo, {run.algo for run in find_runs(folder, [], [])}),
+            ("-e", envs, {run.env for run in find_runs(folder, options.algo, [])}),
         ):
             for name in wanted:
                 if name not in there:

@@ -54,6 +54,14 @@ def without_folder(name: str) -> str:
     return Path(name).name if is_file(name) else name
 
 
+def without_module(env_id: str) -> str:
+    """
+    :param env_id: id of an environment
+    :return: the same, of ``module:Env-v0`` without the module that registers it
+    """
+    return env_id.rpartition(":")[2]
+
+
 def load_algorithm(name: str) -> type["BaseAlgorithm"]:
     """
     Import an algorithm. That of a file runs the file.

@@ -45,10 +45,10 @@ class StoredRun:
         steps = self.steps
         if self.run.checkpoints.is_dir():  # a model may also be that of an interrupted run
             steps = min(steps, max(checkpoint_files(self.run.checkpoints), default=0))
-        return steps >= self.config.settings.n_timesteps or self._stopped_by_reward
+        return steps >= self.config.settings.n_timesteps or self.solved
 
     @property
-    def _stopped_by_reward(self) -> bool:
+    def solved(self) -> bool:
         """Whether ``stop_reward`` ended it, and its model is saved."""
         stop_reward = self.config.settings.stop_reward
         if stop_reward is None:

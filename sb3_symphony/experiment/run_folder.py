@@ -9,7 +9,7 @@ import yaml
 
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.registry import without_folder
+from sb3_symphony.experiment.registry import without_folder, without_module
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class RunFolder:
         :param env_id: id of an environment
         :return: the id as it appears in file names
         """
-        return env_id.rpartition(":")[2].replace("/", "-")
+        return without_module(env_id).replace("/", "-")
 
     @staticmethod
     def numbers(parent: Path, env_name: str) -> set[int]:

@@ -24,7 +24,7 @@ from sb3_symphony.experiment.config import (
     run_settings,
     shipped_folder,
 )
-from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder
+from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder, without_module
 from sb3_symphony.experiment.run_folder import RunFolder
 
 _DEFAULT_ALGO, _DEFAULT_ENV = TrainOptions().algo, TrainOptions().env
@@ -191,7 +191,7 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
     config = read_yaml(run.details / "config.yml") if run else {}
     # RL Zoo keeps the arguments of the environment with the command line's
     env_kwargs = {**(config.get("env_kwargs") or {}), **(trained.get("env_kwargs") or {})}
-    if env_id != trained.get("env", env_id):
+    if without_module(env_id) != without_module(trained.get("env", env_id)):
         env_kwargs = {}  # of another environment
     settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": env_kwargs})
     settings = settings.varied(options.env_kwargs, options.env_wrapper)

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError, Threads, TrainOptions, read_yaml, shipped_folder
-from sb3_symphony.experiment.registry import without_folder
+from sb3_symphony.experiment.registry import without_folder, without_module
 from sb3_symphony.experiment.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ def read_space(options: TuneOptions) -> SearchSpace:
     path = Path(shipped_folder() / "tuning" / f"{options.algo}.yml" if options.space is None else options.space)
     content = read_yaml(path)
     where = str(path)
-    for name in (options.env, "default"):
+    for name in (options.env, without_module(options.env), "default"):
         if name in content:
             where, content = f"{path}: {name}", content[name]
             break

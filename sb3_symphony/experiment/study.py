@@ -401,6 +401,8 @@ def read_study(path: Path, quick: bool = False, only: Sequence[str] = ()) -> Stu
 
 
 def _check(study: Study, folder: Path) -> None:
+    if study.matrix is not None and study.final_episodes == 0:
+        raise ConfigError("final_episodes: 0 — expected 1 or more for the conditions of the matrix")
     for algorithm in study.algorithms:
         check_algorithm(_algo(algorithm, folder))
     for name in study.sweeps:

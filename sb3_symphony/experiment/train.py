@@ -1,6 +1,7 @@
 """One training run, from options to files on disk."""
 
 import shlex
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -61,6 +62,7 @@ class TrainResult:
     :param seconds: wall-clock time of learning, that before a resume included
     :param interrupted: whether it was stopped by a signal
     :param untouched: whether there was nothing left to do in a run that was to be resumed
+    :param solved: whether that is because its ``stop_reward`` was reached
     """
 
     run: RunFolder
@@ -69,6 +71,7 @@ class TrainResult:
     seconds: float
     interrupted: bool = False
     untouched: bool = False
+    solved: bool = False
 
     def plain(self) -> dict[str, Any]:
         """:return: the result as plain values, for JSON"""
@@ -85,8 +88,9 @@ class TrainResult:
     def summary(self) -> str:
         """:return: one line for the end of a run"""
         if self.untouched:
-            onward = " (a larger -n goes on)" if any(self.run.checkpoints.glob("*.ckpt")) else ""
-            return f"{self.run.path} is finished: {self.steps} steps — nothing changed{onward}"
+            onward = " (a larger -n goes on)" if not self.solved and any(self.run.checkpoints.glob("*.ckpt")) else ""
+            reached = ", its stop_reward reached" if self.solved else ""
+            return f"{self.run.path} is finished: {self.steps} steps{reached} — nothing changed{onward}"
         evaluated = "not evaluated"
         if self.evaluation:
             mean, spread = np.mean(self.evaluation), np.std(self.evaluation)
@@ -237,7 +241,12 @@ def build_callbacks(options: TrainOptions, config: RunConfig, model: BaseAlgorit
 
 def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     """The model comes last and at once: a run whose model has all steps has everything."""
-    plot_training(run.path)
+    try:
+        plot_training(run.path)
+    except OSError:
+        raise
+    except Exception as error:  # whatever a drawing library stumbles over: the model matters
+        print(f"note: training.png was not drawn — {reason(error)}", file=sys.stderr)
     save_model(model, run.model, run.normalization)
 
 
@@ -332,7 +341,7 @@ def train(options: TrainOptions, command: str | None = None, folder: Path | None
             return _train(options, effective_config(options), command, cleanup, folder=folder)
         stored = open_run(options)
         if stored.finished:
-            return TrainResult(stored.run, stored.steps, [], 0.0, untouched=True)
+            return TrainResult(stored.run, stored.steps, [], 0.0, untouched=True, solved=stored.solved)
         for written in (stored.run.path, stored.run.checkpoints):
             check_folder(written, "--resume")
         cleanup.enter_context(_alone(stored.run))

@@ -17,7 +17,7 @@ from sb3_symphony.common.averaging import AveragedActor
 from sb3_symphony.common.checkpoint import newest_checkpoint
 from sb3_symphony.common.files import DamagedFile
 from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
-from sb3_symphony.experiment.agent import check_match, load_model, load_normalization
+from sb3_symphony.experiment.agent import check_match, check_spaces, load_model, load_normalization
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, of_networks, read_yaml
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import Selection, SelectOptions, select_model
@@ -72,7 +72,7 @@ def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: b
             raise unknown from None
         raise ConfigError(f"-i: {error}") from None
     check_match(trained, env, selection)
-    _take_networks(model, trained, selection)
+    _take_networks(model, trained, str(selection.model))
     assert model.seed is not None
     set_random_seed(model.seed)  # loading has left the trained one's
     if normalization is not None and selection.normalization is not None:
@@ -82,7 +82,31 @@ def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: b
         _take_experience(model, selection)
 
 
-def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, selection: Selection) -> None:
+def check_source(model: BaseAlgorithm, source: BaseAlgorithm, name: str, with_replay_buffer: bool) -> None:
+    """
+    See whether a model can start from another one, which is yet to be trained.
+
+    :param model: a new model with its environment
+    :param source: another new model with its environment; the first one gets its weights
+    :param name: what the other one is called
+    :param with_replay_buffer: whether its replay buffer is to be taken over
+    :raises ConfigError: if it cannot
+    """
+    env, theirs = model.get_env(), source.get_env()
+    assert env is not None and theirs is not None
+    if unwrap_vec_normalize(env) is not None and unwrap_vec_normalize(theirs) is None:
+        raise ConfigError(f"start_from: {name} has no statistics of VecNormalize — expected normalize for both or for neither")
+    check_spaces(source, env, name, "the environment")
+    _take_networks(model, source, name)
+    if with_replay_buffer:
+        buffer = _replay_buffer_of(model)
+        try:
+            add_transitions(buffer, [ReplaySegments.of(_replay_buffer_of(source))])
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"start_from: replay_buffer: {name} — {error}") from None
+
+
+def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, origin: str) -> None:
     given, (names, tensors) = trained.get_parameters(), model._get_torch_save_params()
     try:
         for name in names:
@@ -99,7 +123,7 @@ def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, selection: Sele
     except (RuntimeError, ValueError, KeyError) as error:
         what = str(error).strip().splitlines()[-1].strip()
         raise ConfigError(
-            f"-i: networks of {selection.model} (policy_kwargs {trained.policy_kwargs}) do not fit the configuration's "
+            f"-i: networks of {origin} (policy_kwargs {trained.policy_kwargs}) do not fit the configuration's "
             f"({model.policy_kwargs}) — {what}"
         ) from None
     if isinstance(model.policy, AveragedActor):
@@ -114,10 +138,15 @@ def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, selection: Sele
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _take_experience(model: BaseAlgorithm, selection: Selection) -> None:
+def _replay_buffer_of(model: BaseAlgorithm) -> ReplayBuffer:
     buffer = getattr(model, "replay_buffer", None)
     if not isinstance(buffer, ReplayBuffer):
-        raise ConfigError(f"--with-replay-buffer: {selection.algo} has no replay buffer")
+        raise ConfigError(f"--with-replay-buffer: {type(model).__name__} has no replay buffer")
+    return buffer
+
+
+def _take_experience(model: BaseAlgorithm, selection: Selection) -> None:
+    buffer = _replay_buffer_of(model)
     parts, source = _experience(selection)
     try:
         taken = add_transitions(buffer, parts)

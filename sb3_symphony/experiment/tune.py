@@ -96,6 +96,10 @@ class Plan:
 
         :raises ConfigError: if not
         """
+        if self.configuration.get("stop_reward") is not None:
+            raise ConfigError(
+                f"stop_reward: {self.configuration['stop_reward']} — trials have all of their steps, expected none"
+            )
         with warnings.catch_warnings():
             ignore_mini_batches()
             self._build("", {})
