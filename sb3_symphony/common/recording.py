@@ -184,9 +184,9 @@ class RecordedEpisode(gym.Wrapper):
             own = dict(self._own(wrapper))
             for name, pickled in state.items():
                 value = pickle.loads(pickled)
-                if name not in own and name in vars(wrapper):
+                if name not in own and name in vars(wrapper):  # in a file of an earlier version: of the environment inside
                     continue
-                if _fit_each_other(own.get(name), value):
+                if _same_form(own.get(name), value):
                     own[name][...] = value  # it may be a view of the simulator's memory
                 else:
                     setattr(wrapper, name, value)
@@ -200,7 +200,7 @@ class RecordedEpisode(gym.Wrapper):
                 yield name, value
 
 
-def _fit_each_other(current: Any, value: Any) -> bool:
+def _same_form(current: Any, value: Any) -> bool:
     arrays = isinstance(current, np.ndarray) and isinstance(value, np.ndarray) and current.flags.writeable
     return arrays and (current.shape, current.dtype) == (value.shape, value.dtype)
 

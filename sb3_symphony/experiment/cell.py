@@ -284,7 +284,7 @@ def run_cell(job: Job) -> bool:
         "n_timesteps": options.n_timesteps,
         "steps": result.steps,
         "updates": _updates(run.model),
-        "seconds": round(_seconds(run) if result.untouched else result.seconds, 3),
+        "seconds": round(_seconds(run, options.n_timesteps) if result.untouched else result.seconds, 3),
         "machine": _machine(),
         **({"final": _evaluated(job, {})} if job.final_episodes else {}),
         **({"conditions": _under_conditions(job)} if job.conditions else {}),
@@ -307,12 +307,12 @@ def _updates(model: Path) -> int:
         return int(json.loads(archive.read("data"))["_n_updates"])
 
 
-def _seconds(run: RunFolder) -> float:
+def _seconds(run: RunFolder, n_timesteps: int) -> float:
     """Wall-clock time of a run that had ended before: as it was told then, or else as its last checkpoint has it."""
     from sb3_symphony.common.checkpoint import newest_checkpoint
 
     told = read_result(run.path)
-    if told is not None:
+    if told is not None and told["n_timesteps"] == n_timesteps:
         return float(told["seconds"])
     checkpoint = newest_checkpoint(run.checkpoints)
     assert checkpoint is not None  # a run is finished when it has its last one
