@@ -97,9 +97,8 @@ class Plan:
         :raises ConfigError: if not
         """
         if self.configuration.get("stop_reward") is not None:
-            raise ConfigError(
-                f"stop_reward: {self.configuration['stop_reward']} — trials have all of their steps, expected none"
-            )
+            stop_reward = self.configuration["stop_reward"]
+            raise ConfigError(f"stop_reward: {stop_reward} — expected none, as trials take all of their steps")
         with warnings.catch_warnings():
             ignore_mini_batches()
             self._build("", {})
