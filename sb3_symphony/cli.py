@@ -596,6 +596,11 @@ def _forget_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _fail(command: str, message: str) -> int:
+    print(f"sb3-symphony {command}: error: {message}", file=sys.stderr)
+    return 2
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run the command line.
@@ -627,8 +632,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except ConfigError as error:
-        print(f"sb3-symphony {command}: error: {error}", file=sys.stderr)
-        return 2
+        return _fail(command, str(error))
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # of `sb3-symphony … | head`: nobody reads any more
@@ -637,6 +641,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        print(f"sb3-symphony {command}: error: output cannot be written — {error.strerror}", file=sys.stderr)
         _forget_output()
-        return 2
+        return _fail(command, f"output cannot be written — {error.strerror}")

@@ -175,13 +175,12 @@ class RecordedEpisode(gym.Wrapper):
 
     def _wrappers(self) -> list[dict[str, bytes]]:
         return [
-            {name: pickled for name, value in self._own(wrapper) if (pickled := _pickled(value)) is not None}
-            for wrapper in self._inner_wrappers()
+            {name: pickled for name, value in own.items() if (pickled := _pickled(value)) is not None}
+            for _, own in self._own_attributes()
         ]
 
     def _set_wrappers(self, states: list[dict[str, bytes]]) -> None:
-        for wrapper, state in zip(self._inner_wrappers(), states, strict=True):
-            own = dict(self._own(wrapper))
+        for (wrapper, own), state in zip(self._own_attributes(), states, strict=True):
             for name, pickled in state.items():
                 value = pickle.loads(pickled)
                 if name not in own and name in vars(wrapper):  # in a file of an earlier version: of the environment inside
@@ -191,13 +190,16 @@ class RecordedEpisode(gym.Wrapper):
                 else:
                     setattr(wrapper, name, value)
 
-    def _own(self, wrapper: gym.Wrapper) -> Iterator[tuple[str, Any]]:
-        """Attributes of a wrapper that may be its state: no part of the environment inside, which has its own."""
+    def _own_attributes(self) -> Iterator[tuple[gym.Wrapper, dict[str, Any]]]:
+        """Wrappers and what may be their state: no part of the environment inside, which has its own."""
         inside = {id(value) for value in vars(self.unwrapped).values() if not isinstance(value, _PLAIN)}
-        for name, value in vars(wrapper).items():
-            other = name in _NOT_WRAPPER_STATE or callable(value) or isinstance(value, gym.Env | gym.Space)
-            if not other and id(value) not in inside:
-                yield name, value
+        for wrapper in self._inner_wrappers():
+            yield wrapper, {name: value for name, value in vars(wrapper).items() if _is_own(name, value, inside)}
+
+
+def _is_own(name: str, value: Any, inside: set[int]) -> bool:
+    other = name in _NOT_WRAPPER_STATE or callable(value) or isinstance(value, gym.Env | gym.Space)
+    return not other and id(value) not in inside
 
 
 def _same_form(current: Any, value: Any) -> bool:

@@ -31,6 +31,7 @@ from sb3_symphony.common.recording import RecordedEpisode
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
 from sb3_symphony.experiment.config import ConfigError, RunSettings, reason
 from sb3_symphony.experiment.decode import typed_arguments
+from sb3_symphony.experiment.registry import without_module
 
 #: evaluation episode i runs on environment seed 10 000 + i
 EVALUATION_SEED = 10_000
@@ -208,7 +209,7 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
     except Exception as error:  # whatever a user's own module or environment does
         raise ConfigError(f"environment '{env_id}' cannot be made — {type(error).__name__}: {error}") from error
     registered = env.spec.id if env.spec is not None else env_id
-    if registered != env_id.rpartition(":")[2]:  # Gymnasium takes the latest version; settings and folders go by the full id
+    if registered != without_module(env_id):  # Gymnasium takes the latest version; settings and folders go by the full id
         env.close()
         raise ConfigError(f"unknown environment '{env_id}': did you mean '{registered}'?")
     if needs_fresh_world(env):

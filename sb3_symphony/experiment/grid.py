@@ -146,8 +146,8 @@ def _check_models(progress: Sequence[Progress]) -> None:
     from sb3_symphony.experiment.train import build_model
     from sb3_symphony.experiment.transfer import check_source
 
-    def model_of(cell: Cell) -> "BaseAlgorithm":
-        model = build_model(cell.options, configuration(cell), seed=0, verbose=0)
+    def model_of(cell: Cell, config: RunConfig) -> "BaseAlgorithm":
+        model = build_model(cell.options, config, seed=0, verbose=0)
         env = model.get_env()
         assert env is not None
         env.close()
@@ -156,9 +156,10 @@ def _check_models(progress: Sequence[Progress]) -> None:
     for each in {(p.cell.algorithm, p.cell.environment.id): p for p in progress if not p.kept}.values():
         cell = each.cell
         try:
-            model = model_of(cell)
+            model = model_of(cell, each.config)
             if cell.start_from is not None:
-                check_source(model, model_of(cell.start_from), cell.start_from.name, cell.options.with_replay_buffer)
+                source = model_of(cell.start_from, configuration(cell.start_from))
+                check_source(model, source, cell.start_from.name, cell.options.with_replay_buffer)
             keep_protocol(cell.options, each.config)
             for name, condition in cell.conditions.items():
                 _check_condition(name, condition, cell, each.config, model)

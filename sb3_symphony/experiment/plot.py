@@ -135,7 +135,7 @@ def _default_output(options: PlotOptions, groups: "list[Group]") -> Path:
     """One run's figure lies in its folder, those of several beside each other."""
     if len(groups) == 1 and len(groups[0].runs) == 1:
         return groups[0].runs[0].path / f"{options.kind}.png"
-    names = "_".join(dict.fromkeys(group.env.rpartition(":")[2].replace("/", "-") for group in groups))
+    names = "_".join(dict.fromkeys(group.env.replace("/", "-") for group in groups))
     return Path("" if options.runs else options.folder) / f"{names}_{options.kind}.png"
 
 

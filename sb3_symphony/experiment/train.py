@@ -243,7 +243,7 @@ def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     """The model comes last and at once: a run whose model has all steps has everything."""
     try:
         plot_training(run.path)
-    except OSError:
+    except OSError:  # told by those around, as where the model itself does not fit the disk
         raise
     except Exception as error:  # whatever a drawing library stumbles over: the model matters
         print(f"note: training.png was not drawn — {reason(error)}", file=sys.stderr)
