@@ -460,6 +460,11 @@ def test_spaces_of_evaluations(limit, key):
         train(options(eval_freq=60, eval_env_kwargs={"limit": limit, "key": key}, **dicts))
 
 
+def test_evaluations_that_never_come():
+    with pytest.raises(ConfigError, match=r"--eval-env-kwargs: {'limit': 2.0} — needs evaluations, expected --eval-freq > 0"):
+        train(options(eval_freq=0, eval_env_kwargs={"limit": 2.0}, hyperparams=SMALL))
+
+
 def test_stop_reward(capsys):
     small = {**SMALL, "stop_reward": -1900.0}  # any agent is better
     result = train(options(n_timesteps=5000, hyperparams=small, eval_freq=60, save_freq=50))
