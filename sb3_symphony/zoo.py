@@ -79,7 +79,8 @@ def _task_wrappers(env_wrapper: Any) -> list[Any]:
     """RL Zoo's ``env_wrapper`` as a list, without those that change only what is learned from."""
     wrappers = env_wrapper if isinstance(env_wrapper, list) else [env_wrapper] if env_wrapper else []
     names = [next(iter(wrapper)) if isinstance(wrapper, dict) else wrapper for wrapper in wrappers]
-    trained = [isinstance(name, str) and for_training_only(name) for name in names]
+    # Others are outside RL Zoo's monitor in evaluations, too
+    trained = [isinstance(name, str) and name.startswith("sb3_symphony.") and for_training_only(name) for name in names]
     return [wrapper for wrapper, left_out in zip(wrappers, trained, strict=True) if not left_out]
 
 

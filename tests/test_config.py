@@ -30,7 +30,7 @@ from sb3_symphony.experiment.config import (
     validated,
 )
 from sb3_symphony.experiment.decode import algorithm_arguments, argument_types, class_by_name, typed_arguments
-from sb3_symphony.experiment.environment import find_wrapper, split_wrappers
+from sb3_symphony.experiment.environment import find_wrapper, for_training_only, split_wrappers
 from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
 
 ACTIONS = spaces.Box(-1.0, 1.0, (4,))
@@ -272,6 +272,8 @@ def test_wrappers():
     assert [w.func for w in task] == [gym.wrappers.ClipAction] and [w.func for w in training] == [RewardFloor]
     for name in (
         "os.system",
+        "gymnasium.wrappers.NormalizeObservation",  # whose statistics would not be kept
+        "gymnasium.wrappers.NormalizeReward",
         "stable_baselines3.common.monitor.Monitor",  # writes files
         "gymnasium.wrappers.RecordVideo",
         "gymnasium.wrappers.np",
@@ -280,6 +282,10 @@ def test_wrappers():
     ):
         with pytest.raises(ConfigError, match="env_wrapper"):
             find_wrapper(name)
+    with pytest.raises(ConfigError, match="NormalizeReward' — expected as the key normalize"):
+        find_wrapper("gymnasium.wrappers.NormalizeReward")
+    for name in ("gymnasium.wrappers.ClipReward", "stable_baselines3.common.atari_wrappers.ClipRewardEnv"):
+        assert for_training_only(name)
     with pytest.raises(ConfigError, match="did you mean 'RewardFloor'"):
         find_wrapper("sb3_symphony.common.wrappers.RewardFlor")
     with pytest.raises(ConfigError, match="did you mean 'floor'"):

@@ -55,6 +55,11 @@ def run_onnx(content, observations):
     return session.run(None, {"observation": observations})[0]
 
 
+def exported(model, normalization=None):
+    """Of vectors, whose raw observations are in the model's own space."""
+    return onnx_model(model, model.observation_space, normalization)
+
+
 def half_range(space):
     return (space.high - space.low) / 2
 
@@ -78,12 +83,12 @@ def test_equal_to_predict(algo, normalize):
     if not normalize:
         raw /= [1, 1e4, 1, 1e3]  # networks are for numbers near 1
     expected, _ = model.predict(env.normalize_obs(raw) if normalize else raw, deterministic=True)
-    given = run_onnx(onnx_model(model, env if normalize else None), raw)
+    given = run_onnx(exported(model, env if normalize else None), raw)
     assert given.shape == expected.shape == (1000, 2, 2) and given.dtype == np.float32
     assert np.abs((given - expected) / half_range(env.action_space)).max() <= 1e-5
     assert np.std(given, axis=0).min() > 1e-3  # they do depend on the observation
     for row in (0, 7):  # any number of observations at once
-        assert run_onnx(onnx_model(model, env if normalize else None), raw[row : row + 1]) == pytest.approx(
+        assert run_onnx(exported(model, env if normalize else None), raw[row : row + 1]) == pytest.approx(
             given[[row]], rel=1e-5
         )
 
@@ -92,7 +97,7 @@ def test_equal_to_predict(algo, normalize):
 def test_state_dependent_exploration(algo):
     model = load_algorithm(algo)("MlpPolicy", "Pendulum-v1", use_sde=True, seed=0, device="cpu")
     observations = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
-    given = run_onnx(onnx_model(model, None), observations)
+    given = run_onnx(exported(model), observations)
     assert np.abs(given - model.predict(observations, deterministic=True)[0]).max() <= 1e-5
 
 
@@ -100,7 +105,7 @@ def test_actions_without_bounds_of_their_own_are_clipped():
     model = PPO("MlpPolicy", "Pendulum-v1", seed=0, device="cpu")
     model.policy.action_net.bias.data += 100
     observations = np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
-    assert (run_onnx(onnx_model(model, None), observations) == 2.0).all()
+    assert (run_onnx(exported(model), observations) == 2.0).all()
 
 
 def test_trained_batch_statistics_are_inside():
@@ -108,7 +113,7 @@ def test_trained_batch_statistics_are_inside():
     model = load_algorithm("crossq")("MlpPolicy", "Pendulum-v1", **small, seed=0, device="cpu")
     model.learn(120)
     observations = np.random.default_rng(0).normal(size=(100, 3)).astype(np.float32)
-    given = run_onnx(onnx_model(model, None), observations)
+    given = run_onnx(exported(model), observations)
     assert np.abs(given - model.predict(observations, deterministic=True)[0]).max() <= 2e-5
 
 
@@ -122,7 +127,7 @@ def test_images():
 
     model = PPO("CnnPolicy", Images(), n_steps=8, batch_size=8, seed=0, device="cpu")
     images = np.random.default_rng(0).integers(0, 256, (5, 3, 36, 36), dtype=np.uint8)
-    assert run_onnx(onnx_model(model, None), images) == pytest.approx(model.predict(images, deterministic=True)[0], abs=1e-5)
+    assert run_onnx(exported(model), images) == pytest.approx(model.predict(images, deterministic=True)[0], abs=1e-5)
 
 
 class LastChannels(Unequal):
@@ -157,6 +162,32 @@ def test_images_with_their_channels_last(folder, capsys, normalize, frame_stack)
     assert f"(36, 40, {channels})" in properties["observation_space"]
 
 
+def test_normalised_images(folder, capsys):
+    """What VecNormalize makes of them is no image, the file's input is one."""
+    small = ["n_steps:32", "batch_size:32", "n_epochs:1", "normalize:true", "policy_kwargs.net_arch:[8]"]
+    argv = "train --algo ppo --env LastChannels-v0 -n 32 --eval-freq 0 --seed 0 --device cpu --quiet -params"
+    assert main([*argv.split(), *small]) == 0
+    assert main("export --algo ppo --env LastChannels-v0 -o images.onnx".split()) == 0
+    assert "equal to predict on 1000 observations" in capsys.readouterr().out
+    properties = {item.key: item.value for item in onnx.load("images.onnx").metadata_props}
+    assert properties["observation_space"] == "Box(0, 255, (36, 40, 3), uint8)"
+    image = np.zeros((1, 36, 40, 3), dtype=np.uint8)
+    assert run_onnx((folder / "images.onnx").read_bytes(), image).shape == (1, 2)
+
+
+def test_episodes_without_an_end(folder):
+    class Endless(Unequal):
+        def step(self, action):
+            return (*super().step(action)[:3], False, {})
+
+    gym.register("Endless-v0", entry_point=Endless)
+    try:
+        SAC("MlpPolicy", "Endless-v0", buffer_size=10, policy_kwargs={"net_arch": [8]}, device="cpu").save("sac")
+        assert export(ExportOptions(model="sac.zip", algo="sac", env="Endless-v0")).path.is_file()
+    finally:
+        del gym.registry["Endless-v0"]
+
+
 def test_command(folder, capsys):
     env = VecNormalize(make_vec_env("Unequal-v0", seed=0))
     PPO("MlpPolicy", env, n_steps=64, batch_size=64, seed=0, device="cpu").learn(128).save("ppo")
@@ -175,7 +206,7 @@ def test_command(folder, capsys):
 def test_a_wrong_file_is_not_written(folder, monkeypatch):
     SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs={"net_arch": [8]}, device="cpu").save("sac")
     other = SAC("MlpPolicy", "Pendulum-v1", buffer_size=10, policy_kwargs={"net_arch": [8]}, device="cpu")
-    content = onnx_model(other, None)
+    content = exported(other)
     monkeypatch.setattr("sb3_symphony.experiment.export.onnx_model", lambda *args: content)
     with pytest.raises(RuntimeError, match="differs from predict"):
         export(ExportOptions(model="sac.zip", algo="sac", env="Pendulum-v1"))

@@ -193,6 +193,14 @@ def test_command(model, capsys):
     assert json.loads(capsys.readouterr().out)[0]["reward"] == one["reward"]
 
 
+def test_an_agent_that_acts_every_second_step(model, monkeypatch):
+    recorded = []
+    monkeypatch.setattr("sb3_symphony.experiment.gait.plot_gait", lambda recordings, *args: recorded.extend(recordings))
+    skip = "stable_baselines3.common.atari_wrappers.MaxAndSkipEnv:{skip: 2}"
+    assert main(["gait", "agent", "--env-wrapper", skip, *WALK]) == 0
+    assert recorded[0].steps_per_second == 25.0 and recorded[0].times[0] == pytest.approx(0.04)
+
+
 def test_no_pictures(model):
     assert main(["gait", "agent", *WALK, "--n-frames", "0"]) == 0
 
@@ -200,7 +208,7 @@ def test_no_pictures(model):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ("--skip 30", "--skip: 30 s — td3 walked for 1.2 s only on seed 0"),
+        ("--skip 30", "--skip: 30 s — td3 walked for 1.2 s only on seed 0, as -n 60 wants"),
         ("-o gait.mp4", "expected a file name that ends with .png or .svg or .pdf"),
         ("--json nowhere/x.json", "there is no folder nowhere"),
         ("--window 0", "window: 0.0"),

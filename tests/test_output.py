@@ -1,5 +1,6 @@
 """Files named on the command line: refused early, written whole."""
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file, output_folder, write_output
+from sb3_symphony.experiment.output import output_file, output_folder, report, write_output
 
 
 @contextmanager
@@ -42,6 +43,16 @@ def test_good_names(folder):
     assert [path.name for path in folder.iterdir()] == ["new"] and not list((folder / "new" / "folder").iterdir())
 
 
+def test_results_are_told_if_they_cannot_be_written(folder, monkeypatch, capsys):
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with report("a.json") as tell, pytest.raises(ConfigError, match=r"--json: 'a\.json' cannot be written — No space left"):
+        tell({"mean_reward": 3})
+    assert json.loads(capsys.readouterr().out) == {"mean_reward": 3} and not list(folder.iterdir())
+
+
 def test_bad_names(folder):
     (folder / "file").touch()
     for call, message in (
@@ -54,7 +65,7 @@ def test_bad_names(folder):
         (lambda: output_file("no/a", "-o"), "-o: 'no/a' cannot be written — there is no folder no"),
         (lambda: output_file("a" * 300, "-o"), f"-o: '{'a' * 300}' cannot be written — File name too long"),
         (lambda: output_file("/dev/null", "-o"), "-o: '/dev/null' cannot be written — it is no regular file"),
-        (lambda: output_folder("file", "-o"), "-o: 'file' cannot be written — File exists"),
+        (lambda: output_folder("file", "-o"), "-o: 'file' cannot be written — it is no folder"),
         (lambda: output_folder("file/below", "-o"), "-o: 'file/below' cannot be written — Not a directory"),
     ):
         with pytest.raises(ConfigError) as error:

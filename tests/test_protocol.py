@@ -56,7 +56,8 @@ def test_what_contradicts_it(options, message):
 
 
 def test_transforms_of_what_is_learned_from_are_allowed():
-    wrappers = {"sb3_symphony.common.wrappers.RewardFloor": {"floor": -10}}
+    floor = {"floor": -10}
+    wrappers = [{"sb3_symphony.common.wrappers.RewardFloor": floor}, {"gymnasium.wrappers.ClipReward": {"max_reward": 3}}]
     assert kept(hyperparams={"env_wrapper": wrappers, "normalize": True}).eval_freq == 2_500
 
 

@@ -174,7 +174,7 @@ VARIANTS = {
         {
             **SMALL,
             "env_wrapper": [
-                "gymnasium.wrappers.NormalizeObservation",
+                {"gymnasium.wrappers.DelayObservation": {"delay": 2}},
                 {"gymnasium.wrappers.TimeAwareObservation": {}},
                 {"sb3_symphony.common.wrappers.StallPenalty": {"coef": 0.05}},
                 {"sb3_symphony.common.wrappers.StrideBonus": {"per_radian": True}},
@@ -506,7 +506,7 @@ def fill_disk_at(monkeypatch, name):
     monkeypatch.setattr(os, "fsync", full)
 
 
-@pytest.mark.parametrize("name", ["000000200.segment", "rl_model_200_steps.zip", "checkpoint_000000200.ckpt"])
+@pytest.mark.parametrize("name", ["000000200.segment", "checkpoint_000000200.ckpt"])
 def test_no_room_for_a_checkpoint(monkeypatch, killed, capsys, name):
     whole = train(options(log_folder="a")).run.path
     with monkeypatch.context() as patched:
@@ -519,6 +519,17 @@ def test_no_room_for_a_checkpoint(monkeypatch, killed, capsys, name):
     resume(run)
     assert_same_results(whole, run)
     assert not list((run / "checkpoints").glob(".*.tmp"))
+
+
+def test_no_room_for_a_saved_model(monkeypatch):
+    whole = train(options(log_folder="a")).run.path
+    with monkeypatch.context() as patched, pytest.raises(ConfigError, match="No space left on device — once there is room"):
+        fill_disk_at(patched, "rl_model_200_steps.zip")
+        train(options(log_folder="b"))
+    run = Path("b/td3/Pendulum-v1_1")
+    assert [path.name for path in run.glob("*rl_model*")] == ["rl_model_100_steps.zip"]  # no part of the other
+    resume(run)
+    assert_same_results(whole, run)
 
 
 def test_no_room_at_the_end(monkeypatch, capsys):

@@ -158,6 +158,25 @@ def test_a_configuration_that_is_no_run(folder):
     assert found.run is None and not found.normalization_known
 
 
+def test_runs_that_a_model_does_not_belong_to(folder):
+    """Two copies of RL Zoo's Hub repositories side by side, files in one folder; a run beside a folder of models."""
+    for name in ("sac-Pendulum-v1", "sac-Pendulum-v1-moon"):
+        (folder / name).mkdir()
+        (folder / name / "sac-Pendulum-v1.zip").touch()
+        (folder / name / "config.yml").write_text("{n_timesteps: 10, normalize: true}")
+        (folder / name / "args.yml").write_text("{algo: sac, env: Pendulum-v1}")
+    (folder / "beside.zip").touch()
+    for path in ("sac-Pendulum-v1-moon/sac-Pendulum-v1.zip", "beside.zip"):
+        found = select(model=path, algo="td3", env="Pendulum-v1")
+        assert found.run is None and found.settings.normalize is False and not found.normalization_known
+    run = make_run(folder / "logs")
+    (run / "others").mkdir()
+    (run / "others" / "mine.zip").touch()
+    assert select(model=str(run / "others" / "mine.zip"), algo="td3", env="Pendulum-v1").run is None
+    make_run(folder / "logs", number=2, files=["best_model.zip"])  # did not end
+    assert select(model="logs/sac/Pendulum-v1_2/best_model.zip").algo == "sac"
+
+
 def test_run_of_rl_zoo(folder):
     run = make_run(folder / "logs", algo="ppo", files=["Pendulum-v1.zip", "Pendulum-v1/vecnormalize.pkl"])
     (run / "Pendulum-v1" / "config.yml").write_text(ZOO_CONFIG)

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_symphony.analysis.runs import find_runs, group_runs
 from sb3_symphony.cli import main
 from sb3_symphony.common.wrappers import FreshBox2DWorld
-from sb3_symphony.experiment.config import RunSettings, TrainOptions, load_config
+from sb3_symphony.experiment.config import RunSettings, TrainOptions, load_config, reason
 from sb3_symphony.experiment.environment import EpisodeSeeds, make_evaluation_env, make_training_env
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import SelectOptions, select_model
@@ -41,14 +41,15 @@ def monitor_returns(run):
     return np.loadtxt(run.path / "0.monitor.csv", delimiter=",", skiprows=2, ndmin=2)[:, 0]
 
 
-def test_a_picture_that_fails_costs_no_model(folder, capsys, monkeypatch):
+@pytest.mark.parametrize("error", [RuntimeError("no fonts"), OSError(28, "No space left on device")])
+def test_a_picture_that_fails_costs_no_model(folder, capsys, monkeypatch, error):
     def broken(path):
-        raise RuntimeError("no fonts")
+        raise error
 
     monkeypatch.setattr("sb3_symphony.experiment.train.plot_training", broken)
     run = train(options()).run
     assert TD3.load(run.model).num_timesteps == 250
-    assert "note: training.png was not drawn — RuntimeError: no fonts" in capsys.readouterr().err
+    assert f"note: training.png was not drawn — {reason(error)}" in capsys.readouterr().err
 
 
 def test_a_run_is_found_with_the_module_of_its_environment():

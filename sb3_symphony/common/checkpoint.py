@@ -228,8 +228,6 @@ class ExactCheckpoints(BaseCallback):
     :param keep: number of checkpoints to keep, >= 1; with 1 there is none to go back to if the newest is damaged
     :param callbacks: callbacks whose counts and collected values belong to the state
     :param files: gives the files (such as ``0.monitor.csv``) whose content belongs to the state
-    :param beside: gives files that have to be on the disk before a checkpoint is, such as a best model that is not to be
-        made again
     :param checkpoint: where to go on from; ``learn()`` is then called as for the whole run, with the total number of steps
     :param wanted: asked at the start of each rollout whether a checkpoint is wanted there, for example before stopping
     :param report: what to do with a message
@@ -242,7 +240,6 @@ class ExactCheckpoints(BaseCallback):
         keep: int = 2,
         callbacks: Sequence[BaseCallback] = (),
         files: Callable[[], Sequence[Path]] = tuple,
-        beside: Callable[[], Sequence[Path]] = tuple,
         checkpoint: Checkpoint | None = None,
         wanted: Callable[[], bool] = bool,
         report: Callable[[str], None] = print,
@@ -255,7 +252,6 @@ class ExactCheckpoints(BaseCallback):
         self.keep = keep
         self.callbacks = callbacks
         self.files = files
-        self.beside = beside
         self.wanted = wanted
         self.report = report
         self.finished = False  # whether learn() came to its end, with everything learned that was experienced
@@ -323,9 +319,6 @@ class ExactCheckpoints(BaseCallback):
                 state["buffer"] = buffer_state(self._buffer)
                 state["segments"] = self.segments.save(self._buffer, self._rows_before + steps // model.n_envs)
                 state["rows before"] = self._rows_before
-            for path in self.beside():
-                with open(path, "r+b") as file:
-                    os.fsync(file.fileno())
             seal(self.folder / f"checkpoint_{steps:09d}.ckpt", state)
         except OSError as error:
             self.report(f"no checkpoint at {steps} steps: {error.strerror} — training goes on, older ones are unharmed")

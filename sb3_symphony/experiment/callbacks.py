@@ -20,7 +20,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.statistics import first_stable_evaluation
@@ -91,6 +91,21 @@ def save_model(model: BaseAlgorithm, path: Path, normalization_path: Path) -> No
     content = io.BytesIO()
     model.save(content)
     write_atomically(path, content.getvalue())
+
+
+class SavedModels(CheckpointCallback):
+    """
+    SB3's ``CheckpointCallback`` with statistics of ``VecNormalize``, whose files are whole on a full disk too, or not there.
+
+    :param save_freq: calls between two models
+    :param save_path: their folder
+    """
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.save_freq == 0:
+            statistics = self._checkpoint_path("vecnormalize_", extension="pkl")
+            save_model(self.model, Path(self._checkpoint_path(extension="zip")), Path(statistics))
+        return True
 
 
 class SaveBestModel(BaseCallback):

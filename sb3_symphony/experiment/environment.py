@@ -39,8 +39,16 @@ EVALUATION_SEED = 10_000
 _WRAPPER_PACKAGES = ("sb3_symphony.", "gymnasium.wrappers.", "stable_baselines3.", "sb3_contrib.")
 #: a configuration must not choose what is written where
 _WRITE_FILES = {"Monitor", "RecordVideo", "VecMonitor", "VecVideoRecorder"}
-_OWN_KEYS = {"VecNormalize": "normalize", "VecFrameStack": "frame_stack"}
-_TRAINING_ONLY = (LearningReward, EpisodeStepLimit)
+#: and has keys for what the run folder keeps the statistics of, or a loaded model needs
+_OWN_KEYS = {
+    "VecNormalize": "normalize",
+    "VecFrameStack": "frame_stack",
+    "NormalizeObservation": "normalize",
+    "NormalizeReward": "normalize",
+}
+#: change the reward and nothing else: reported returns stay the environment's own
+REWARD_WRAPPERS = (LearningReward, gym.RewardWrapper)
+_TRAINING_ONLY = (*REWARD_WRAPPERS, EpisodeStepLimit)
 _ON_POLICY = ("ppo", "trpo")
 _ON_POLICY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
@@ -89,7 +97,7 @@ def find_wrapper(name: str, key: str = "env_wrapper") -> type:
         module = import_module(module_name)
     except ImportError:
         raise ConfigError(f"{key}: '{name}' — there is no module '{module_name}'") from None
-    if class_name in _OWN_KEYS and key == "vec_env_wrapper":
+    if class_name in _OWN_KEYS:
         raise ConfigError(f"{key}: '{name}' — expected as the key {_OWN_KEYS[class_name]}")
     kind = gym.Wrapper if key == "env_wrapper" else VecEnvWrapper
     wrappers = [
@@ -104,10 +112,11 @@ def find_wrapper(name: str, key: str = "env_wrapper") -> type:
 
 def for_training_only(name: str) -> bool:
     """
-    :param name: dotted name of any wrapper
+    :param name: dotted name of a wrapper, as a configuration may name it
     :return: whether it changes only what is learned from, and is left out where agents are evaluated or shown
+    :raises ConfigError: if there is none
     """
-    return name.startswith("sb3_symphony.") and issubclass(find_wrapper(name), _TRAINING_ONLY)
+    return issubclass(find_wrapper(name), _TRAINING_ONLY)
 
 
 def split_wrappers(named: list[tuple[str, dict[str, Any]]]) -> tuple[Wrappers, Wrappers]:

@@ -106,7 +106,8 @@ def export(options: ExportOptions) -> Export:
     with open_agent(options.model_copy(update={"device": "cpu"})) as agent:
         path = output_file(options.output or agent.selection.beside(".onnx"), "--output", (".onnx",))
         _check_exportable(agent)
-        content = onnx_model(agent.model, _normalization(agent), _properties(agent), _transposition(agent) is not None)
+        transposes = _transposition(agent) is not None
+        content = onnx_model(agent.model, _raw_space(agent), _normalization(agent), _properties(agent), transposes)
         difference = _difference(content, agent)
     write_output(path, content, "--output")
     return Export(path, difference)
@@ -114,12 +115,14 @@ def export(options: ExportOptions) -> Export:
 
 def onnx_model(
     model: BaseAlgorithm,
+    space: spaces.Box,
     normalization: VecNormalize | None,
     properties: dict[str, str] | None = None,
     transposes: bool = False,
 ) -> bytes:
     """
     :param model: model with an array observation and continuous actions, on the CPU
+    :param space: raw observations, before they are normalised and transposed
     :param normalization: statistics of the observations, None without
     :param properties: what the file is to say about itself
     :param transposes: whether observations are images with their channels last, which the policy wants first
@@ -127,12 +130,9 @@ def onnx_model(
     """
     import onnx
 
-    space = model.observation_space
-    assert isinstance(space, spaces.Box)
     actor = DeployedActor(model.policy, normalization, transposes).eval()
     model.policy.set_training_mode(False)
-    shape = (*space.shape[1:], space.shape[0]) if transposes else space.shape
-    example = th.as_tensor(np.zeros((1, *shape), dtype=space.dtype))
+    example = th.as_tensor(np.zeros((1, *space.shape), dtype=space.dtype))
     batch = {0: "batch"}
     content = io.BytesIO()
     with th.no_grad(), warnings.catch_warnings():
@@ -175,13 +175,19 @@ def _check_exportable(agent: Agent) -> None:
         raise ConfigError(f"{selection.model}: stacks normalised observations — expected no frame_stack, or no normalize")
 
 
+def _raw_space(agent: Agent) -> spaces.Box:
+    """Observations below ``VecNormalize``, which makes images real numbers, and ``VecTransposeImage``, around it."""
+    outer = _normalization(agent) or _transposition(agent)
+    space = agent.model.observation_space if outer is None else outer.venv.observation_space
+    assert isinstance(space, spaces.Box)
+    return space
+
+
 def _properties(agent: Agent) -> dict[str, str]:
-    transposition = _transposition(agent)
-    raw = agent.model.observation_space if transposition is None else transposition.venv.observation_space
     return {
         "algorithm": agent.selection.algo,
         "environment": agent.selection.env_id,
-        "observation_space": str(raw),
+        "observation_space": str(_raw_space(agent)),
         "action_space": str(agent.model.action_space),
     }
 
@@ -191,15 +197,16 @@ def _raw_observations(agent: Agent) -> np.ndarray:
     normalization, transposed = _normalization(agent), _transposition(agent) is not None
     found: list[np.ndarray] = []
     seed = 0
-    while len(found) < N_OBSERVATIONS:
+    while True:
         for step in agent.episode(seed, deterministic=False):  # for variety
             if normalization is not None:
                 found.append(np.asarray(normalization.get_original_obs())[0])
             else:
                 observation = np.asarray(step.observation)
                 found.append(np.moveaxis(observation, 0, -1) if transposed else observation)
+            if len(found) == N_OBSERVATIONS:  # in the middle of an episode, which may have no end
+                return np.stack(found)
         seed += 1
-    return np.stack(found[:N_OBSERVATIONS])
 
 
 def _difference(content: bytes, agent: Agent) -> float:

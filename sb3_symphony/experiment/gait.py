@@ -135,7 +135,8 @@ def record_gait(shown: Shown, options: GaitOptions) -> Gait:
             break
     if length < skip + 2:
         walked = f"{shown.label} walked for {length / per_second:.1f} s only on seed {options.seed}"
-        raise ConfigError(f"--skip: {options.skip:g} s — {walked}")
+        cut = f", as -n {length} wants" if length == options.n_timesteps else ""
+        raise ConfigError(f"--skip: {options.skip:g} s — {walked}{cut}")
     joints = np.degrees(sensors.joints)  # Box2D turns legs forward, knees backward
     contact = np.array(sensors.contact)
 

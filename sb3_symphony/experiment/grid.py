@@ -253,7 +253,7 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
         backend = open_backend(options.backend, options.n_jobs, options.address, gpus)
         try:
             new = not folder.exists()
-            with _alone(output_folder(folder, "-f")), full_disk_told(folder, "the same command goes on"):
+            with _alone(output_folder(folder, "-f")), full_disk_told([folder], "the same command goes on"):
                 session = _new_session(backend, folder, new)
                 _write_settings(progress, folder, path)
                 interrupted = _run_ready(study, progress, folder, session, backend)

@@ -54,6 +54,8 @@ def output_folder(name: str | Path, flag: str) -> Path:
     path = Path(name)
     try:
         path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise ConfigError(f"{flag}: '{name}' cannot be written — it is no folder") from None
     except OSError as error:
         raise ConfigError(f"{flag}: '{name}' cannot be written — {error.strerror}") from None
     _try_to_write(path, name, flag)
@@ -93,10 +95,14 @@ def report(name: str | None) -> Iterator[Callable[[Any], None]]:
 
     def tell(values: Any) -> None:
         text = json.dumps(values, indent=1, default=str)
+        try:
+            if path is not None:
+                write_output(path, (text + "\n").encode(), "--json")
+        except ConfigError:
+            print(text)  # what has taken minutes is not lost with it
+            raise
         if name == "-":
             print(text)
-        elif path is not None:
-            write_output(path, (text + "\n").encode(), "--json")
 
     yield tell
 
@@ -136,11 +142,11 @@ def write_output(path: Path, content: bytes, flag: str) -> None:
 
 
 @contextmanager
-def full_disk_told(path: Path, onward: str = "") -> Iterator[None]:
+def full_disk_told(paths: Sequence[Path], onward: str = "") -> Iterator[None]:
     """
     A full disk ends the block with one line.
 
-    :param path: what is written inside, for messages
+    :param paths: what is written inside, for messages
     :param onward: what to do once there is room, in words
     :raises ConfigError: if the disk is full
     """
@@ -150,4 +156,5 @@ def full_disk_told(path: Path, onward: str = "") -> Iterator[None]:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         hint = f" — once there is room, {onward}" if onward else ""
-        raise ConfigError(f"'{path}' cannot be written: {error.strerror}{hint}") from error
+        places = " or ".join(f"'{path}'" for path in paths)
+        raise ConfigError(f"{places} cannot be written: {error.strerror}{hint}") from error

@@ -5,9 +5,8 @@ from importlib import import_module
 import gymnasium as gym
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from sb3_symphony.common.wrappers import LearningReward
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
-from sb3_symphony.experiment.environment import find_wrapper
+from sb3_symphony.experiment.environment import REWARD_WRAPPERS, find_wrapper
 from sb3_symphony.experiment.registry import load_algorithm
 
 #: environment steps between evaluations; once the environment is solved only every fourth of them takes place
@@ -63,7 +62,7 @@ def keep_protocol(options: TrainOptions, config: RunConfig) -> TrainOptions:
         names = ", ".join([*config.settings.env_kwargs, *options.eval_env_kwargs])
         raise ConfigError(f"env_kwargs: '{names}' — --protocol {options.protocol} is for the environment as registered")
     for name, _ in config.settings.env_wrapper:
-        if not issubclass(find_wrapper(name), LearningReward):
+        if not issubclass(find_wrapper(name), REWARD_WRAPPERS):
             raise ConfigError(f"env_wrapper: '{name}' — changes the task, which --protocol {options.protocol} leaves as it is")
     for name, _ in config.settings.vec_env_wrapper:
         raise ConfigError(f"vec_env_wrapper: '{name}' — --protocol {options.protocol} is for the environment as registered")

@@ -111,10 +111,6 @@ class RunFolder:
         """:return: files that get longer while training, as far as they are there"""
         return [*sorted(self.path.glob("*.monitor.csv")), *self.path.glob("evaluations.npz")]
 
-    def saved_models(self) -> list[Path]:
-        """:return: models saved so far, and what belongs to them"""
-        return [*self.path.glob("*.zip"), *self.path.glob("*.pkl")]
-
     @property
     def log_folder(self) -> Path:
         """File that says where the TensorBoard log is."""

@@ -150,7 +150,7 @@ def _select(options: SelectOptions) -> Selection:
         else:
             if not path.exists() and path.suffix != ".zip":
                 path = path.with_name(path.name + ".zip")
-            run = next((found for parent in list(path.absolute().parents)[:3] if (found := _run_of(parent))), None)
+            run = _run_of(path)
     elif options.exp_id == -1:
         algo, env_id = options.algo or _DEFAULT_ALGO, options.env or _DEFAULT_ENV
         options = options.model_copy(update={"algo": algo, "env": env_id})
@@ -229,12 +229,13 @@ def _run_at(path: Path) -> RunFolder | None:
     return None
 
 
-def _run_of(path: Path) -> RunFolder | None:
-    """The same, if it is one beyond doubt: any project may have a ``conf/config.yml`` above its models."""
-    run = _run_at(path)
-    if run is not None and not (run.details / "args.yml").is_file() and not run.model.is_file():
-        return None
-    return run
+def _run_of(model: Path) -> RunFolder | None:
+    """The run folder that a model lies in, beyond doubt: any project may have a ``conf/config.yml`` beside its models."""
+    run = _run_at(model.absolute().parent)
+    if run is None or run.model.is_file():
+        return run
+    args = run.details / "args.yml"
+    return run if args.is_file() and RunFolder.file_name(str(read_yaml(args).get("env"))) == run.env_name else None
 
 
 def _find_run(options: SelectOptions) -> RunFolder:

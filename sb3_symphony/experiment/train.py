@@ -14,7 +14,7 @@ import torch as th
 from filelock import FileLock, Timeout
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
@@ -25,6 +25,7 @@ from sb3_symphony.experiment.callbacks import (
     NoteLogFolder,
     ReturnProgressBar,
     SaveBestModel,
+    SavedModels,
     SeededEvaluation,
     StopOnSignal,
     configured_callbacks,
@@ -167,9 +168,8 @@ def _evaluation(
     )
 
 
-def _saved_models(options: TrainOptions, config: RunConfig, run: RunFolder) -> CheckpointCallback:
-    frequency = max(options.save_freq // config.settings.n_envs, 1)
-    return CheckpointCallback(frequency, str(run.path), save_vecnormalize=True)
+def _saved_models(options: TrainOptions, config: RunConfig, run: RunFolder) -> SavedModels:
+    return SavedModels(max(options.save_freq // config.settings.n_envs, 1), str(run.path))
 
 
 @contextmanager
@@ -214,7 +214,6 @@ def _checkpoints(
         options.keep,
         callbacks=tuple(callbacks),
         files=run.growing_files,
-        beside=run.saved_models,
         checkpoint=checkpoint,
         wanted=stop.here,
     )
@@ -243,9 +242,7 @@ def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     """The model comes last and at once: a run whose model has all steps has everything."""
     try:
         plot_training(run.path)
-    except OSError:  # told by those around, as where the model itself does not fit the disk
-        raise
-    except Exception as error:  # whatever a drawing library stumbles over: the model matters
+    except Exception as error:  # whatever a drawing library stumbles over, a full disk too: the model matters
         print(f"note: training.png was not drawn — {reason(error)}", file=sys.stderr)
     save_model(model, run.model, run.normalization)
 
@@ -389,7 +386,7 @@ def _train(
         beginning = f" ({_resuming(checkpoint, model)})"
         command = f"{run.command}\n{command}".lstrip()
         restore_files(run, checkpoint)
-    with full_disk_told(run.path):
+    with full_disk_told([run.path]):
         run.write_configuration(used.model_dump(exclude=_NOT_OF_THE_RUN), config.plain, command)
         attach_monitor_files(env, run.path, append=checkpoint is not None)
 
@@ -412,8 +409,9 @@ def _train(
     total = config.settings.n_timesteps
     if not options.quiet:
         print(f"{options.algo} on {options.env}, seed {seed}: {total} steps into {run.path}{beginning}", flush=True)
-    onward = "--resume goes on from the newest checkpoint" if options.save_freq > 0 else ""
-    with stop.listening(), full_disk_told(run.path, onward):
+    onward = "--resume goes on from the newest checkpoint, if there is one yet" if options.save_freq > 0 else ""
+    written = [run.path, *([Path(options.tensorboard_log)] if options.tensorboard_log else [])]
+    with stop.listening(), full_disk_told(written, onward):
         try:
             model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:

@@ -20,6 +20,8 @@ import numpy as np
 from matplotlib.font_manager import findfont
 from matplotlib.ticker import EngFormatter
 from PIL import Image, ImageDraw, ImageFont
+from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
+from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError
@@ -88,8 +90,9 @@ class Shown:
 
     @property
     def steps_per_second(self) -> float:
-        """Of the simulated world."""
-        return float(self.camera.metadata.get("render_fps") or 30)
+        """Of the simulated world, as many as the agent acts."""
+        skips = unwrap_wrapper(self.camera, MaxAndSkipEnv)
+        return float(self.camera.metadata.get("render_fps") or 30) / (skips._skip if isinstance(skips, MaxAndSkipEnv) else 1)
 
     def most_steps(self, wanted: int | None) -> int | None:
         """
@@ -360,7 +363,7 @@ def _default_output(options: VideoOptions, agents: Sequence[Shown]) -> Path:
         return Path(f"{selection.env_id.rpartition(':')[2].replace('/', '-')}_grid.mp4")
     if selection.run is None or selection.shipped:
         return selection.beside(".mp4")
-    return output_folder(selection.run / "videos", "video") / f"{selection.model.stem}.mp4"
+    return output_folder(selection.run / "videos", "--output") / f"{selection.model.stem}.mp4"
 
 
 def video(options: VideoOptions) -> list[Path]:
