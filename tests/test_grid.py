@@ -5,9 +5,11 @@ import os
 import re
 import shutil
 import signal
+import socketserver
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -546,12 +548,24 @@ def test_other_mistakes_leave_nothing(folder, capsys):
     assert [path.name for path in folder.iterdir()] == ["study.yml"]
 
 
+class Hello(socketserver.BaseRequestHandler):
+    """Speaks as soon as somebody calls, and not HTTP/2."""
+
+    def handle(self):
+        self.request.sendall(b"SSH-2.0-none\r\n")
+
+
 def test_an_address_where_nobody_answers(folder, capsys):
     pytest.importorskip("ray", reason="ray is not installed")
     study = str(write_study(folder, seeds=1))
     ray = ["bench", study, "--backend", "ray", "--address"]
     assert "nobody answers at '127.0.0.1:1' — Connection refused" in fails(capsys, *ray, "127.0.0.1:1")
     assert "'ray://127.0.0.1:1' — Connection refused" in fails(capsys, *ray, "ray://127.0.0.1:1")
+    with socketserver.TCPServer(("127.0.0.1", 0), Hello) as other, ThreadPoolExecutor() as pool:
+        pool.submit(other.serve_forever)
+        address = f"127.0.0.1:{other.server_address[1]}"
+        assert f"--address: what answers at '{address}' is no Ray cluster" in fails(capsys, *ray, address)
+        other.shutdown()
     assert "'nonsense' — expected auto, HOST:PORT or ray://HOST:PORT" in fails(capsys, *ray, "nonsense")
     assert [path.name for path in folder.iterdir()] == ["study.yml"]
 

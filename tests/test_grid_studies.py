@@ -3,6 +3,7 @@
 import copy
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -228,6 +229,36 @@ def test_a_search_of_another_space(study, tmp_path, fails):
     sweep = {**STUDY["sweeps"]["rate"], "n_trials": 3}  # goes on
     (tmp_path / "study.yml").write_text(yaml.safe_dump({**STUDY, "sweeps": {"rate": sweep}}))
     assert main(["bench", str(tmp_path / "study.yml"), "-f", str(study / "results"), "--dry-run", "-a", "base"]) == 0
+
+
+def test_a_search_is_checked_before_anything_runs(tmp_path, fails):
+    (tmp_path / "own_td3.py").write_text(OWN)
+    (tmp_path / "space.yml").write_text("gamma: [0.9, 1.5]\n")
+    (tmp_path / "study.yml").write_text(yaml.safe_dump(STUDY))
+    for flags in ([], ["--dry-run"]):
+        fails(["bench", str(tmp_path / "study.yml"), "-f", str(tmp_path / "results"), *flags], "sweeps: rate: ", "gamma: 1.5")
+    assert not (tmp_path / "results").exists()
+
+
+def test_each_variant_has_settings_of_its_own(tmp_path, monkeypatch):
+    """Names of algorithms and environments may hold what joins others."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    study = {
+        "algorithms": [
+            {"name": "td3", "environments": ["tune_helpers:Fast_Line-v0"], "overrides": {"gamma": 0.9}},
+            {"name": "td3_Fast", "algo": "td3", "environments": ["tune_helpers:Line-v0"], "overrides": {"gamma": 0.5}},
+        ],
+        "environments": ["tune_helpers:Fast_Line-v0", "tune_helpers:Line-v0"],
+        "seeds": 1,
+        "steps": 20,
+        "final_episodes": 0,
+        "protocol": {"eval_freq": 0},
+    }
+    (tmp_path / "study.yml").write_text(yaml.safe_dump(study))
+    assert main(["bench", str(tmp_path / "study.yml"), "-j", "1", "-f", str(tmp_path / "results")]) == 0
+    for name, gamma in (("td3/Fast_Line-v0_0", 0.9), ("td3_Fast/Line-v0_0", 0.5)):
+        run = tmp_path / "results" / name
+        assert yaml.safe_load((run / run.name.rpartition("_")[0] / "config.yml").read_text())["gamma"] == gamma
 
 
 def test_more_steps_of_an_agent_that_another_began_with(study, tmp_path, fails):

@@ -112,6 +112,8 @@ def test_entry_of_the_environment_comes_before_the_default(tmp_path):
         ("tau: {float: [0, 1], log: 3}", "log: 3 — expected true or false"),
         ("tau: {float: [0, 1], step: 2}", r"step: 2 — expected a number in \(0, 1\]"),
         ("tau: {int: [1, 9], step: 2, log: true}", "step: 2"),
+        ("tau: {int: [16, 60], step: 16}", "step: 16 — does not lead from 16 to 60, but to 48 or 64"),
+        ("tau: {float: [0, 1], step: 0.3}", "step: 0.3 — does not lead from 0 to 1, but to 0.9 or 1.2"),
         ("tau: [1, 2, 1]", "1 is there twice"),
         ("tau: 0.1", r"tau: 0.1 — expected \[choice, …\]"),
         ("default: {}", "space.yml: default: {} — expected a mapping"),

@@ -335,7 +335,7 @@ def test_nothing_is_written_for_a_mistake(played, options, tmp_path):
     [
         ({"algo": "trpo", "space": "other.yml"}, "has algo ppo, not trpo — expected the same .--algo"),
         ({"env": "Pendulum-v1"}, "has env tune_helpers:Line-v0, not Pendulum-v1 — expected the same .--env"),
-        ({"hyperparams": {"gae_lambda": 0.5}}, "has configuration: gae_lambda None, not 0.5"),
+        ({"hyperparams": {"gae_lambda": 0.5}}, "has no configuration: gae_lambda, here 0.5"),
         ({"n_timesteps": 192}, "has configuration: n_timesteps 96, not 192 — expected the same .-conf, -params, -n"),
         ({"seed": 5}, r"has seeds \[100, 101\], not \[5, 6\] — expected the same .--seed"),
         ({"space": "other.yml"}, "has space: learning_rate"),

@@ -63,6 +63,7 @@ class Line(gym.Env):
 
 
 gym.register("Line-v0", entry_point=Line)
+gym.register("Fast_Line-v0", entry_point=Line)
 
 
 def files(folder: Path, space: dict[str, Any] = SPACE, **configuration: Any) -> list[str]:

@@ -132,16 +132,26 @@ def _seen(token: str) -> tuple[str, str | None, dict[str, str]]:
     return socket.gethostname(), content, _versions()
 
 
+#: how HTTP/2, which Ray's servers speak, begins, with settings that change nothing (RFC 9113, 3.4)
+_GREETING = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\x04" + bytes(5)
+
+
 def _reachable(address: str) -> None:
-    """Ray takes two minutes to find that nobody answers, and then ends the process."""
+    """Where nobody answers, Ray takes two minutes to find out and then ends the process; where others do, it waits on."""
     host, colon, port = address.removeprefix("ray://").rpartition(":")
     if not (colon and host and port.isdecimal() and int(port) < 65_536):
         raise ConfigError(f"--address: '{address}' — expected auto, HOST:PORT or ray://HOST:PORT")
     try:
-        socket.create_connection((host, int(port)), timeout=5).close()
+        with socket.create_connection((host, int(port)), timeout=5) as connection:
+            if os.environ.get("RAY_USE_TLS", "0") != "0":
+                return
+            connection.sendall(_GREETING)
+            answer = connection.recv(9)  # a frame's head: length, type, flags, stream
     except OSError as error:
         reason = error.strerror or str(error)
         raise ConfigError(f"--address: nobody answers at '{address}' — {reason} (`ray start --head` prints it)") from None
+    if answer[3:4] != b"\x04":  # not of settings
+        raise ConfigError(f"--address: what answers at '{address}' is no Ray cluster (`ray start --head` prints its address)")
 
 
 class Ray:

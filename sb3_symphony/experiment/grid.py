@@ -4,7 +4,7 @@
 Results lie in one folder, which holds all that is needed to go on or to make the tables anew::
 
     <folder>/study.yml                       the study
-    <folder>/settings/<algorithm>_<env>.yml  merged hyper-parameters of each variant, and files of its own algorithms
+    <folder>/settings/<algorithm>@<env>.yml  merged hyper-parameters of each variant, and files of its own algorithms
     <folder>/sweeps/<algo>/tune/<name>/      what a search has found
     <folder>/<algorithm>/<env>_<seed>/       run folder of a cell, with result.json once it is done
     <folder>/<algorithm>/<env>_<seed>.log    what its process printed
@@ -33,6 +33,7 @@ from sb3_symphony.experiment.grid_progress import Progress, standings
 from sb3_symphony.experiment.grid_report import collect, on_page, report
 from sb3_symphony.experiment.registry import is_file, without_folder
 from sb3_symphony.experiment.signals import handled_by
+from sb3_symphony.experiment.space import TuneOptions
 from sb3_symphony.experiment.study import Cell, Study, configuration, found_by, read_study, sweep_options
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
@@ -120,6 +121,7 @@ def bench(options: BenchOptions) -> BenchResult:
         from sb3_symphony.experiment.grid_view import plain_table
 
         _check_models([each for each in progress if not each.kept])
+        _check_searches(study, progress, path, folder)
         return BenchResult(folder, plain_table(progress), untouched=True)
     if options.report:
         from sb3_symphony.experiment.output import output_folder, write_output
@@ -167,6 +169,25 @@ def _check_models(progress: Sequence[Progress]) -> None:
             raise ConfigError(f"{cell.algorithm} on {cell.environment.id}: {error}") from None
 
 
+def _searches(study: Study, progress: Sequence[Progress], path: Path, folder: Path) -> Iterator[tuple[str, TuneOptions]]:
+    """Searches that cells wait for, in the study's order."""
+    wanted = {each.cell.sweep for each in progress if each.cell.waits}
+    for name in study.sweeps:
+        if name in wanted:
+            yield name, sweep_options(study, name, path.absolute().parent, folder)
+
+
+def _check_searches(study: Study, progress: Sequence[Progress], path: Path, folder: Path) -> None:
+    """Build a model with each value of the spaces, as :func:`_check_models` does with settings that are known."""
+    for name, options in _searches(study, progress, path, folder):
+        from sb3_symphony.experiment.tune import Plan  # Optuna takes a second
+
+        try:
+            Plan.read(options).check()
+        except ConfigError as error:
+            raise ConfigError(f"sweeps: {name}: {error}") from None
+
+
 def _check_condition(name: str, condition: dict[str, Any], cell: Cell, config: RunConfig, model: "BaseAlgorithm") -> None:
     from sb3_symphony.experiment.agent import check_spaces
     from sb3_symphony.experiment.environment import check_task_wrappers, make_evaluation_env
@@ -199,7 +220,8 @@ def _write_settings(progress: Sequence[Progress], folder: Path, study: Path) -> 
 
 
 def _settings_file(progress: Progress, folder: Path) -> Path:
-    return folder / "settings" / f"{progress.cell.algorithm}_{progress.run.env_name}.yml"
+    # Neither name can hold an @, so that no two cells meet in one file
+    return folder / "settings" / f"{progress.cell.algorithm}@{progress.run.env_name}.yml"
 
 
 def _job(progress: Progress, folder: Path, session: Path, tensorboard: bool) -> Job:
@@ -249,6 +271,7 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
     if left:
         print(f"{len(left)} of {len(progress)} cells to do, into {folder}", flush=True)
         _check_models(left)
+        _check_searches(study, left, path, folder)
         gpus = any(each.cell.options.device.startswith("cuda") for each in left)
         backend = open_backend(options.backend, options.n_jobs, options.address, gpus)
         try:
@@ -302,9 +325,7 @@ def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, p
     from sb3_symphony.experiment.tune import tune
 
     cores = options.n_jobs or os.cpu_count() or 1
-    wanted = {each.cell.sweep for each in progress if each.cell.waits}
-    for name in (name for name in study.sweeps if name in wanted):
-        sweep = sweep_options(study, name, path.absolute().parent, folder)
+    for name, sweep in _searches(study, progress, path, folder):
         n_jobs = max(1, cores // sweep.seeds_per_trial)
         result = tune(sweep.model_copy(update={"n_jobs": n_jobs}))
         print(result.summary, flush=True)

@@ -15,6 +15,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -260,6 +261,12 @@ def _interval(where: str, spec: dict[str, Any]) -> Interval:
         raise ConfigError(f"{where}: [{bounds[0]}, {bounds[1]}] — expected low > 0 for log: true")
     if step is not None and (log or not 0 < step <= high - low):
         raise ConfigError(f"{where}: step: {spec['step']} — expected a number in (0, {high - low:g}], and no log: true")
+    if step is not None:
+        first, last, distance = (Fraction(str(number)) for number in (low, high, step))
+        below = low + (last - first) // distance * step
+        if (last - first) % distance:
+            near = f"{below:g} or {below + step:g}"
+            raise ConfigError(f"{where}: step: {spec['step']} — does not lead from {low:g} to {high:g}, but to {near}")
     return Interval(low, high, log, step)
 
 
@@ -299,7 +306,10 @@ def read_space(options: TuneOptions) -> SearchSpace:
     given = options.hyperparams
     parameters = {name: parameter for name, parameter in space.parameters.items() if name not in given}
     if not parameters:
-        raise ConfigError(f"{where}: nothing is left to search — expected a hyper-parameter that -params does not give")
+        raise ConfigError(
+            f"{where}: nothing is left to search — expected a hyper-parameter with more than one choice that -params "
+            "does not give"
+        )
     return SearchSpace(where, parameters, {name: value for name, value in space.fixed.items() if name not in given})
 
 

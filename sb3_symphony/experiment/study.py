@@ -55,6 +55,8 @@ def _seeds(value: Any) -> Any:
     """``10`` means 0 to 9."""
     if not isinstance(value, int) or isinstance(value, bool):
         return value
+    if value < 1:
+        raise ValueError("expected at least one")
     if value > _MOST_SEEDS:
         raise ValueError(f"expected how many seeds, or a list of them: [{value}] is one seed")
     return list(range(value))
@@ -69,6 +71,17 @@ def _some(value: Any) -> Any:
 _Item = TypeVar("_Item")
 _List = Annotated[list[_Item], BeforeValidator(_some)]
 _Seeds = Annotated[_List[Annotated[int, Field(ge=0, lt=2**31)]], BeforeValidator(_seeds)]
+
+
+def _check_name(value: str) -> None:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", value):
+        raise ValueError("expected letters, digits and . _ + - (it names a folder)")
+
+
+def _named(value: dict[Any, Any]) -> dict[str, Any]:
+    """A mapping whose names may be numbers in the file."""
+    _check_twice("names", [str(name) for name in value])
+    return {str(name): item for name, item in value.items()}
 
 
 class Start(BaseModel):
@@ -119,8 +132,9 @@ class Algorithm(BaseModel):
     @field_validator("name")
     @classmethod
     def _folder_name(cls, value: str) -> str:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", value):
-            raise ValueError("expected letters, digits and . _ + - (it names a folder)")
+        _check_name(value)
+        if value.lower() in ("settings", "sweeps") or Path(value).suffix in (".csv", ".md", ".png", ".yml"):
+            raise ValueError("is a folder or file that all studies have, expected another name")
         return value
 
     @model_validator(mode="after")
@@ -199,7 +213,7 @@ class Condition(BaseModel):
 def _conditions(value: Any) -> Any:
     if not isinstance(value, dict) or not value:
         raise ValueError("expected a mapping of names to what is different, such as {delayed: {action_delay: 2}}")
-    return {str(name): _part(Condition, None, condition) for name, condition in value.items()}
+    return {name: _part(Condition, None, condition) for name, condition in _named(value).items()}
 
 
 class Matrix(BaseModel):
@@ -248,13 +262,20 @@ def _settled(options: Any, names: Iterable[str], instead: str = "") -> None:
 
 
 #: options of ``tune`` that a study does not settle
-_NOT_OF_SWEEPS = ("log_folder", "n_jobs", "num_threads", "storage", "study_name", "show", "heartbeat", "device")
+_NOT_OF_SWEEPS = ("log_folder", "n_jobs", "num_threads", "storage", "study_name", "show", "heartbeat", "device", "timeout")
 
 
 def _sweeps(value: Any) -> Any:
     if not isinstance(value, dict):
         raise ValueError("expected a mapping of names to options of tune, such as {tuned: {algo: td3, n_trials: 50}}")
-    return {str(name): _sweep(options) for name, options in value.items()}
+    value = _named(value)
+    for name in value:
+        try:
+            _check_name(name)
+        except ValueError as error:
+            raise ConfigError(f"'{name}' — {error}") from None
+    _check_twice("names", [name.lower() for name in value])  # folders, on any disk
+    return {name: _sweep(options) for name, options in value.items()}
 
 
 def _sweep(options: Any) -> TuneOptions:
@@ -392,9 +413,10 @@ def read_study(path: Path, quick: bool = False, only: Sequence[str] = ()) -> Stu
     try:
         study: Study = validated(Study, values)
         _check(study, path.absolute().parent)
-        if quick:
-            study = _quick(study)
-            _check(study, path.absolute().parent)
+        if quick or study.quick is not None:
+            shorter = _quick(study)
+            _check(shorter, path.absolute().parent)
+            study = shorter if quick else study
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return _only(study, only) if only else study
@@ -420,7 +442,12 @@ def _check(study: Study, folder: Path) -> None:
         _check_twice(f"{each.name}: seeds" if each.seeds else "seeds", each.seeds or study.seeds)
         _chosen(f"algorithms: {each.name}: environments", each.environments, environments)
         if each.sweep is not None:
-            _chosen(f"algorithms: {each.name}: sweep", [each.sweep], study.sweeps)
+            (search,) = _chosen(f"algorithms: {each.name}: sweep", [each.sweep], study.sweeps)
+            wanted = each.algo or each.name
+            if search.algo != wanted:
+                raise ConfigError(
+                    f"algorithms: {each.name}: sweep: {each.sweep} is of algorithm '{search.algo}' — expected '{wanted}'"
+                )
         if each.start_from is not None:
             where = f"algorithms: {each.name}: start_from"
             (source,) = _chosen(where, [each.start_from.algorithm], algorithms)

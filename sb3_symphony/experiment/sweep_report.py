@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import shlex
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -144,11 +145,11 @@ class SweepReport:
 
     def _best_yaml(self, best: FrozenTrial) -> str:
         plan = self.plan
-        completed = self._count(TrialState.COMPLETE)
+        completed, best_file = self._count(TrialState.COMPLETE), self.folder / "best.yml"
         lines = [
             f"Trial {best.number} of the study '{self.study.study_name}', the best of {completed} that completed:",
             f"mean return {best.value:.2f} of {plan['eval_episodes']} episodes for each of the seeds {plan['seeds']}.",
-            f"sb3-symphony train --algo {plan['algo']} --env {plan['env']} -conf {self.folder / 'best.yml'}",
+            shlex.join(["sb3-symphony", "train", "--algo", plan["algo"], "--env", plan["env"], "-conf", str(best_file)]),
         ]
         text = yaml.safe_dump(self.configuration(best), sort_keys=False, allow_unicode=True)
         return "".join(f"# {line}\n" for line in lines) + text

@@ -137,9 +137,9 @@ class Plan:
         for key, value in self.plain().items():
             if found.get(key) != value:
                 what, there, here = _difference(key, found.get(key), value)
-                raise ConfigError(
-                    f"{where} has {what} {there}, not {here} — expected the same ({_FLAGS[key]}), or another name"
-                )
+                told = f"has no {what}, here {here}" if there is None else f"has {what} {there}, not {here}"
+                told = f"has {what} {there}, here none" if here is None else told
+                raise ConfigError(f"{where} {told} — expected the same ({_FLAGS[key]}), or another name")
 
 
 def _difference(name: str, found: Any, wanted: Any) -> tuple[str, Any, Any]:
