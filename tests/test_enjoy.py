@@ -109,7 +109,7 @@ def test_flags_of_rl_zoo(agent, capsys):
         (["-n", "0"], "n_timesteps: 0"),
         (["--n-envs", "0"], "n_envs: 0"),
         (["--norm-reward"], "--norm-reward: sac.zip has no VecNormalize statistics"),
-        (["--reward-log", "sac.zip"], "--reward-log: 'sac.zip' cannot be written — File exists"),
+        (["--reward-log", "sac.zip"], "--reward-log: 'sac.zip' cannot be written — it is no folder"),
         (["--env-kwargs", "gravity:1"], "gravity"),
     ],
 )

@@ -509,7 +509,7 @@ def test_a_worker_of_loky_that_dies_is_replaced(folder, die_once):
     ],
 )
 def test_mistakes_in_a_study_leave_nothing(folder, capsys, changes, message):
-    study = write_study(folder, **changes)
+    study = write_study(folder, quick={"seeds": 1}, **changes)
     assert message in fails(capsys, "bench", str(study))
     assert [path.name for path in folder.iterdir()] == ["study.yml"]
 

@@ -274,6 +274,10 @@ def test_algorithms_of_a_file(write, tmp_path):
             {"final_episodes": 0, "matrix": {"label": "x", "conditions": {"a": {}}}},
             "final_episodes: 0 — expected 1 or more for the conditions of the matrix",
         ),
+        (
+            {"quick": {"final_episodes": 0}, "matrix": {"label": "x", "conditions": {"a": {}}}},
+            "quick: final_episodes: 0 — expected 1 or more for the conditions of the matrix",
+        ),
         ({"final_episodes": True}, "final_episodes: True — expected a whole number"),
     ],
 )

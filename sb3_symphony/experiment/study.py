@@ -415,7 +415,10 @@ def read_study(path: Path, quick: bool = False, only: Sequence[str] = ()) -> Stu
         _check(study, path.absolute().parent)
         if quick or study.quick is not None:
             shorter = _quick(study)
-            _check(shorter, path.absolute().parent)
+            try:
+                _check(shorter, path.absolute().parent)
+            except ConfigError as error:
+                raise ConfigError(f"quick: {error}") from None
             study = shorter if quick else study
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
