@@ -95,14 +95,14 @@ def report(name: str | None) -> Iterator[Callable[[Any], None]]:
 
     def tell(values: Any) -> None:
         text = json.dumps(values, indent=1, default=str)
-        try:
-            if path is not None:
-                write_output(path, (text + "\n").encode(), "--json")
-        except ConfigError:
-            print(text)  # what has taken minutes is not lost with it
-            raise
         if name == "-":
             print(text)
+        elif path is not None:
+            try:
+                write_output(path, (text + "\n").encode(), "--json")
+            except ConfigError:
+                print(text)  # what has taken minutes is not lost with it
+                raise
 
     yield tell
 

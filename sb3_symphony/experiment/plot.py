@@ -12,6 +12,7 @@ from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.output import output_file, report
 from sb3_symphony.experiment.registry import without_module
+from sb3_symphony.experiment.run_folder import RunFolder
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.plots import Curve, Line
@@ -135,7 +136,7 @@ def _default_output(options: PlotOptions, groups: "list[Group]") -> Path:
     """One run's figure lies in its folder, those of several beside each other."""
     if len(groups) == 1 and len(groups[0].runs) == 1:
         return groups[0].runs[0].path / f"{options.kind}.png"
-    names = "_".join(dict.fromkeys(group.env.replace("/", "-") for group in groups))
+    names = "_".join(dict.fromkeys(RunFolder.file_name(group.env) for group in groups))
     return Path("" if options.runs else options.folder) / f"{names}_{options.kind}.png"
 
 

@@ -78,12 +78,6 @@ def _check_name(value: str) -> None:
         raise ValueError("expected letters, digits and . _ + - (it names a folder)")
 
 
-def _named(value: dict[Any, Any]) -> dict[str, Any]:
-    """A mapping whose names may be numbers in the file."""
-    _check_twice("names", [str(name) for name in value])
-    return {str(name): item for name, item in value.items()}
-
-
 class Start(BaseModel):
     """
     Where an algorithm takes its agents from: the networks at the end of another cell of the study, of the same seed.
@@ -213,7 +207,8 @@ class Condition(BaseModel):
 def _conditions(value: Any) -> Any:
     if not isinstance(value, dict) or not value:
         raise ValueError("expected a mapping of names to what is different, such as {delayed: {action_delay: 2}}")
-    return {name: _part(Condition, None, condition) for name, condition in _named(value).items()}
+    _check_twice("names", list(map(str, value)))
+    return {str(name): _part(Condition, None, condition) for name, condition in value.items()}
 
 
 class Matrix(BaseModel):
@@ -268,14 +263,13 @@ _NOT_OF_SWEEPS = ("log_folder", "n_jobs", "num_threads", "storage", "study_name"
 def _sweeps(value: Any) -> Any:
     if not isinstance(value, dict):
         raise ValueError("expected a mapping of names to options of tune, such as {tuned: {algo: td3, n_trials: 50}}")
-    value = _named(value)
-    for name in value:
+    for name in map(str, value):
         try:
             _check_name(name)
         except ValueError as error:
             raise ConfigError(f"'{name}' — {error}") from None
-    _check_twice("names", [name.lower() for name in value])  # folders, on any disk
-    return {name: _sweep(options) for name, options in value.items()}
+    _check_twice("names", [str(name).lower() for name in value])  # folders, on any disk
+    return {str(name): _sweep(options) for name, options in value.items()}
 
 
 def _sweep(options: Any) -> TuneOptions:

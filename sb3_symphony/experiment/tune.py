@@ -137,8 +137,12 @@ class Plan:
         for key, value in self.plain().items():
             if found.get(key) != value:
                 what, there, here = _difference(key, found.get(key), value)
-                told = f"has no {what}, here {here}" if there is None else f"has {what} {there}, not {here}"
-                told = f"has {what} {there}, here none" if here is None else told
+                if there is None:
+                    told = f"has no {what}, here {here}"
+                elif here is None:
+                    told = f"has {what} {there}, here none"
+                else:
+                    told = f"has {what} {there}, not {here}"
                 raise ConfigError(f"{where} {told} — expected the same ({_FLAGS[key]}), or another name")
 
 

@@ -26,6 +26,7 @@ from stable_baselines3.common.env_util import unwrap_wrapper
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.output import output_file, output_folder, progress_bar
+from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import AgentsOptions, Selection, SelectOptions, VideoOptions
 
 SUFFIXES = (".mp4", ".gif")
@@ -360,7 +361,7 @@ def _default_output(options: VideoOptions, agents: Sequence[Shown]) -> Path:
     """In the run's folder, as RL Zoo has it; that of a grid, or of an agent of the package, in the working folder."""
     selection = agents[0].agent.selection
     if options.grid and len(agents) > 1:
-        return Path(f"{selection.env_id.rpartition(':')[2].replace('/', '-')}_grid.mp4")
+        return Path(f"{RunFolder.file_name(selection.env_id)}_grid.mp4")
     if selection.run is None or selection.shipped:
         return selection.beside(".mp4")
     return output_folder(selection.run / "videos", "--output") / f"{selection.model.stem}.mp4"
