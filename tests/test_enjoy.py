@@ -1,5 +1,7 @@
 """Watching an agent, without a screen."""
 
+import errno
+import os
 from pathlib import Path
 
 import gymnasium as gym
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_symphony.cli import main
@@ -62,6 +65,15 @@ def test_several_environments_and_normalised_rewards(folder, capsys):
     assert sorted(np.concatenate(logged)) == pytest.approx(sorted(episode.reward for episode in episodes))
     with pytest.raises(ConfigError, match=r"--reward-log: 'rewards' has a 0\.monitor\.csv already, which is left alone"):
         enjoy(EnjoyOptions(**agent, render=False, reward_log="rewards"))
+
+
+def test_full_disk_names_the_reward_log(agent, monkeypatch):
+    def write_row(self, values):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(ResultsWriter, "write_row", write_row)
+    with pytest.raises(ConfigError, match="'rewards' cannot be written: No space left"):
+        enjoy(EnjoyOptions(**agent, render=False, n_timesteps=200, reward_log="rewards"))
 
 
 def test_window(agent, monkeypatch):

@@ -275,10 +275,10 @@ def find_runs(folder: Path, algos: Iterable[str], envs: Iterable[str]) -> list[R
 
     :param folder: where runs are kept
     :param algos: names of algorithms; none: all
-    :param envs: ids of environments; none: all
+    :param envs: names of environments, as they appear in those of folders; none: all
     :return: the runs, by algorithm in the order given, environment and number; those of a study have its variants' names
     """
-    algos, envs = list(algos), [env.rpartition(":")[2].replace("/", "-") for env in envs]
+    algos, envs = list(algos), list(envs)
     found = []
     for path in folder.glob("*/*_*"):
         name, _, number = path.name.rpartition("_")

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.environment import attach_monitor_files
-from sb3_symphony.experiment.output import output_folder, progress_bar
+from sb3_symphony.experiment.output import full_disk_told, output_folder, progress_bar
 from sb3_symphony.experiment.select import EnjoyOptions
 
 
@@ -50,12 +51,15 @@ def enjoy(options: EnjoyOptions) -> list[EnjoyedEpisode]:
     with open_agent(options, options.n_envs, mode, norm_reward=options.norm_reward) as agent:
         if options.norm_reward and unwrap_vec_normalize(agent.env) is None:
             raise ConfigError(f"--norm-reward: {agent.selection.model} has no VecNormalize statistics")
+        told: AbstractContextManager = nullcontext()
         if options.reward_log is not None:
             attach_monitor_files(agent.env, _log_folder(options.reward_log, options.n_envs))
+            told = full_disk_told([Path(options.reward_log)])
         print(f"{agent.selection.algo} on {agent.selection.env_id}: {agent.selection.model}", flush=True)
         episodes: list[EnjoyedEpisode] = []
         try:
-            _act(agent, options, episodes)
+            with told:
+                _act(agent, options, episodes)
         except KeyboardInterrupt:
             pass  # how one stops watching
     if episodes:

@@ -110,7 +110,7 @@ def _groups(options: PlotOptions) -> "list[Group]":
         runs = [open_run(folder) for folder in folders.values()]
     else:
         folder = Path(options.folder)
-        runs = find_runs(folder, options.algo, options.env)
+        runs = find_runs(folder, options.algo, map(RunFolder.file_name, options.env))
         envs = [without_module(env) for env in options.env]
         for flag, wanted, there in (
             ("-a", options.algo, {run.algo for run in find_runs(folder, [], [])}),

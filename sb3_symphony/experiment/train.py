@@ -134,7 +134,7 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
         arguments = algorithm_arguments(options.algo, algorithm, config, env.action_space)
         _check_goals(env, options.env, arguments.get("replay_buffer_class"))
         if options.tensorboard_log:
-            arguments["tensorboard_log"] = str(Path(options.tensorboard_log) / options.env.replace("/", "-"))
+            arguments["tensorboard_log"] = str(Path(options.tensorboard_log) / RunFolder.file_name(options.env))
         return algorithm(env=env, seed=seed, device=options.device, verbose=verbose, **arguments)
     except Exception as error:  # SB3, or a class that the configuration names, can refuse a value in any way
         env.close()
