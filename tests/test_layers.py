@@ -85,7 +85,7 @@ def test_dropout_masks_drop_each_element_with_the_same_probability_independently
     n_masks = 100 if len(shape) > 1 else 200_000 // shape[0]
     masks = th.full((n_masks, *shape), math.nan)
     for mask in masks:
-        draw_dropout_mask(mask, rate)
+        draw_dropout_mask(mask, rate, 1 / (1 - rate))
     assert masks.unique().tolist() == pytest.approx([0, 1 / (1 - rate)])
     dropped = (masks == 0).double().flatten(1)  # (n_masks, elements)
 
@@ -271,5 +271,5 @@ def test_kernels_compile_where_nothing_can_be_cached(monkeypatch):
         njit(cache=True)(lambda x: x)
     forward = layer_forward.__wrapped__(layer_norm=False, dropout=False, activation=LEAKY_RELU)
     product, bias, unused = np.array([[[1.0, -2.0]]]), np.array([[[0.5, 0.5]]]), np.zeros((1, 1, 2))
-    forward(product, bias, unused, unused, unused, 0.0, 0.1, unused[0], unused, unused, np.array([0]))
+    forward(product, bias, unused, unused, unused, 0.0, 0.1, unused[0], unused, unused, np.array([0]), 1.0)
     np.testing.assert_allclose(product, [[[1.5, -0.15]]])

@@ -225,6 +225,20 @@ def test_targets_that_share_memory_with_nothing():
         assert all(th.equal(x, y) for x, y in zip(copies, (observations, actions, target), strict=True))
 
 
+def test_critics_and_targets_take_turns_in_one_memory():
+    fitter = regression("fused", layer_norm=True, dropout_rate=0.1, activation_fn=LeakySine)
+    observations, actions, target = batch_of(24)
+    fitter.target_q_values(observations, actions)
+    fitter.fit(observations, actions, target, TAU)
+    (own,), (targets,) = fitter._networks.values()
+    for one, other in zip(own.hidden, targets.hidden, strict=True):
+        assert one.weight is not other.weight
+        for name in ("out", "grad", "product", "mask", "rstd", "derivative"):
+            assert getattr(one, name) is getattr(other, name)
+    fitter.fit(*batch_of(12), TAU)  # another batch size, another memory
+    assert fitter._networks[fitter.critic][0].hidden[0].out is not own.hidden[0].out
+
+
 def test_polyak_coefficients():
     for tau in (0.0, 1.0):
         for engine in ("autograd", "fused"):

@@ -162,6 +162,12 @@ class BFloat16Products(Products):
             grad_input.copy_(th.bmm(rounded_grad, weight.transpose(1, 2), out=self.results[0]))
 
 
+def _zeros(linear: StackedLinear, batch_size: int) -> th.Tensor:
+    """Memory for the result of a layer, ``(n_members, batch, width)``."""
+    n_members, _, width = linear.weight.shape
+    return linear.weight.detach().new_zeros(n_members, batch_size, width)
+
+
 MIN_ROUNDED = 4096  # weights per member: below, the casts cost more than the products gain
 
 
@@ -170,16 +176,12 @@ class Layer:
     A linear layer of all members and what follows it.
 
     :param linear: The linear layer
-    :param batch_size: Rows of its input
     """
 
-    def __init__(self, linear: StackedLinear, batch_size: int) -> None:
+    def __init__(self, linear: StackedLinear) -> None:
         self.weight = linear.weight.detach()
         self.parameters: list[nn.Parameter] = [linear.weight, linear.bias]
         self.grads = [th.zeros_like(parameter).detach() for parameter in self.parameters]
-        n_members, _, width = self.weight.shape
-        # The result, and the gradient with respect to it: (n_members, batch, width)
-        self.out, self.grad = (self.weight.new_zeros(n_members, batch_size, width) for _ in range(2))
 
 
 class Hidden(Layer):
@@ -187,6 +189,9 @@ class Hidden(Layer):
     ``Linear → Dropout → LayerNorm → activation``; dropout and LayerNorm may be missing.
 
     The dropout masks are those of the module with the same generator state.
+
+    :param lender: A layer of the same shape, of another network, whose memory is used; what that has computed is lost then.
+        Critics and targets take turns, and what both keep for themselves does not fit a second-level cache
     """
 
     def __init__(
@@ -197,30 +202,41 @@ class Hidden(Layer):
         activation: Activation,
         batch_size: int,
         bfloat16: bool,
+        lender: "Hidden | None" = None,
     ) -> None:
-        super().__init__(linear, batch_size)
+        super().__init__(linear)
         self.dropout, self.activation = dropout, activation
         rounded = bfloat16 and self.weight[0].numel() >= MIN_ROUNDED
         self.products = BFloat16Products(self.weight, batch_size) if rounded else Products(self.weight)
-        # LayerNorm and sine need what they were computed from in their backward pass; the others work in place
-        keeps_product = norm is not None or activation.code == LEAKY_SINE
-        self.product = th.zeros_like(self.out) if keeps_product else self.out
-        self.mask = th.zeros_like(self.out) if dropout is not None else self.out
+        if lender is None:
+            # The result, and the gradient with respect to it: (n_members, batch, width)
+            self.out, self.grad = (_zeros(linear, batch_size) for _ in range(2))
+            # LayerNorm and sine need what they were computed from in their backward pass; the others work in place
+            keeps_product = norm is not None or activation.code == LEAKY_SINE
+            self.product = th.zeros_like(self.out) if keeps_product else self.out
+            self.mask = th.zeros(self.out.shape if dropout is not None else (1, 1, 1), dtype=th.uint8)
+            self.rstd = self.out.new_zeros(self.out.shape[:2])
+            self.derivative = th.zeros_like(self.out) if activation.code == LEAKY_SINE else self.out
+        else:
+            self.out, self.grad, self.product = lender.out, lender.grad, lender.product
+            self.mask, self.rstd, self.derivative = lender.mask, lender.rstd, lender.derivative
         gain = shift = linear.bias  # in place of what the kernel does not use
         if norm is not None:
             gain, shift = norm.weight, norm.bias
             self.parameters += [gain, shift]
             self.grads += [th.zeros_like(gain).detach(), th.zeros_like(shift).detach()]
 
-        product, mask, out, grad = map(array, (self.product, self.mask, self.out, self.grad))
+        product, mask, out, grad, rstd, derivative = map(
+            array, (self.product, self.mask, self.out, self.grad, self.rstd, self.derivative)
+        )
         bias, gains, shifts = map(array, (linear.bias, gain, shift))
-        rstd = np.zeros(out.shape[:2], out.dtype)
-        derivative = np.zeros_like(out) if activation.code == LEAKY_SINE else out
-        eps, slope = out.dtype.type(0 if norm is None else norm.eps), out.dtype.type(activation.slope)
+        self._real = out.dtype.type
+        eps, slope = self._real(0 if norm is None else norm.eps), self._real(activation.slope)
         options = norm is not None, dropout is not None, activation.code
         self._forward = partial(layer_forward(*options), product, bias, mask, gains, shifts, eps, slope, rstd, derivative, out)
         grads = map(array, (self.grads[1], self.grads[-2], self.grads[-1]))
         self._backward = partial(layer_backward(*options), grad, product, out, mask, gains, slope, rstd, derivative, *grads)
+        self._kept = self._real(1)  # factor of what dropout keeps
 
     def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
         """
@@ -231,11 +247,13 @@ class Hidden(Layer):
         n = len(members)
         self.input = x.expand(n, -1, -1)
         self.products.forward(self.input, members, self.product[:n])
-        if self.dropout is not None and self.dropout.training:
-            draw_dropout_mask(self.mask[:n], self.dropout.p)
-        elif self.dropout is not None:
-            self.mask.fill_(1.0)
-        self._forward(members)
+        if self.dropout is not None:
+            if self.dropout.training:
+                draw_dropout_mask(self.mask[:n], self.dropout.p)
+            else:
+                self.mask.fill_(1)
+            self._kept = self._real(self.dropout.scale if self.dropout.training else 1)
+        self._forward(members, self._kept)
         out = self.out[:n]
         return out if self.activation.forward is None else self.activation.forward(out)
 
@@ -246,15 +264,21 @@ class Hidden(Layer):
         """
         if self.activation.backward is not None:
             self.activation.backward(self.grad, self.out)
-        self._backward()
+        self._backward(self._kept)
         return self.grad
 
 
 class Output(Layer):
-    """The last layer, with one unit: matrix-vector products."""
+    """
+    The last layer, with one unit: matrix-vector products.
+
+    :param linear: The linear layer
+    :param batch_size: Rows of its input
+    """
 
     def __init__(self, linear: StackedLinear, batch_size: int) -> None:
-        super().__init__(linear, batch_size)
+        super().__init__(linear)
+        self.out = _zeros(linear, batch_size)
         weight, bias, grad_weight, grad_bias = map(array, (*self.parameters, *self.grads))
         n_members = len(weight)
         self.weights = weight.reshape(n_members, -1), bias.reshape(n_members)
@@ -280,7 +304,8 @@ class WideOutput(Layer):
     """The last layer, with several units. Parameters and return values as in :class:`Output`."""
 
     def __init__(self, linear: StackedLinear, batch_size: int) -> None:
-        super().__init__(linear, batch_size)
+        super().__init__(linear)
+        self.out = _zeros(linear, batch_size)
         self.bias = linear.bias.detach()
         self.products = Products(self.weight)
 
@@ -303,9 +328,13 @@ class FusedNetwork:
     :param network: Its parameters are used where they are; gradients are kept apart from ``parameter.grad``
     :param batch_size: Rows of the input
     :param bfloat16: Whether to round the operands of large products
+    :param lender: Passes of a network of the same shape, for the same batch size, whose memory is used: only the latest of
+        both forward passes can be gone back through
     """
 
-    def __init__(self, network: StackedMLP, batch_size: int, bfloat16: bool = False) -> None:
+    def __init__(
+        self, network: StackedMLP, batch_size: int, bfloat16: bool = False, lender: "FusedNetwork | None" = None
+    ) -> None:
         first = network.layers[0]
         assert isinstance(first, StackedLinear)
         n_members, in_features, _ = first.weight.shape
@@ -322,7 +351,8 @@ class FusedNetwork:
                 norm, following = following, modules.pop(0)
             activation = activation_of(following)
             assert isinstance(linear, StackedLinear) and activation is not None
-            self.hidden.append(Hidden(linear, dropout, norm, activation, batch_size, bfloat16))
+            lending = None if lender is None else lender.hidden[len(self.hidden)]
+            self.hidden.append(Hidden(linear, dropout, norm, activation, batch_size, bfloat16, lending))
         (last,) = modules
         assert isinstance(last, StackedLinear)
         self.output = (Output if last.weight.shape[-1] == 1 else WideOutput)(last, batch_size)

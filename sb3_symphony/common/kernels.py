@@ -64,7 +64,8 @@ def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
     They are the same memory, and only ``product`` is used, if there is neither LayerNorm nor a sine.
 
     :param layer_norm: Whether there is LayerNorm, with ``gain`` and ``shift``; it leaves its factors in ``rstd (n, batch)``
-    :param dropout: Whether there is dropout, with ``mask``
+    :param dropout: Whether there is dropout, with ``mask`` of bytes: 0 for what is dropped, 1 for what is kept and multiplied
+        with ``kept``
     :param activation: One of the constants above; ``slope`` is that of negative values, 0 for a plain ReLU. That of the
         sine is left in ``derivative``
     :return: A kernel; it does not touch the arrays of what is switched off
@@ -72,7 +73,7 @@ def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
     in_place = not layer_norm and activation != LEAKY_SINE
 
     @_compiled
-    def forward(product, bias, mask, gain, shift, eps, slope, rstd, derivative, out, members):
+    def forward(product, bias, mask, gain, shift, eps, slope, rstd, derivative, out, members, kept):
         real = product.dtype.type
         batch, width = product.shape[1:]
         zero, scale = real(0), real(1 / width)
@@ -81,10 +82,10 @@ def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
             for i in range(batch):
                 x = product[s, i]
                 y = x if in_place else out[s, i]
-                keep = mask[s, i] if dropout else b
+                stays = mask[s, i] if dropout else b
                 mean, variance = zero, zero
                 for j in range(width):
-                    x[j] = (x[j] + b[j]) * keep[j] if dropout else x[j] + b[j]
+                    x[j] = (x[j] + b[j]) * (real(stays[j]) * kept) if dropout else x[j] + b[j]
                     mean += x[j]
                 if layer_norm:
                     mean *= scale
@@ -122,7 +123,7 @@ def layer_backward(layer_norm: bool, dropout: bool, activation: int) -> Callable
     in_place = not layer_norm and activation != LEAKY_SINE
 
     @_compiled
-    def backward(grad, normal, out, mask, gain, slope, rstd, derivative, grad_bias, grad_gain, grad_shift):
+    def backward(grad, normal, out, mask, gain, slope, rstd, derivative, grad_bias, grad_gain, grad_shift, kept):
         real = grad.dtype.type
         n, batch, width = grad.shape
         zero, scale = real(0), real(1 / width)
@@ -157,13 +158,28 @@ def layer_backward(layer_norm: bool, dropout: bool, activation: int) -> Callable
                     for j in range(width):
                         d[j] = r * (d[j] - mean - x[j] * along)
                 if dropout:
-                    keep = mask[k, i]
+                    stays = mask[k, i]
                     for j in range(width):
-                        d[j] *= keep[j]
+                        d[j] *= real(stays[j]) * kept
                 for j in range(width):
                     grad_b[j] += d[j]
 
     return backward
+
+
+@_compiled
+def zero_at_gaps(elements, gaps, position):
+    """
+    Set elements to 0, each so many after the one before, the first so many after ``position``.
+
+    Returns the place of the last one; beyond the end if the gaps reach there, else the next gaps are to go on from it.
+    """
+    for gap in gaps:
+        position += gap
+        if position >= elements.size:
+            break
+        elements[position] = 0
+    return position
 
 
 @_compiled

@@ -6,6 +6,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_symphony.common.kernels import zero_at_gaps
+
 
 class LeakySine(nn.Module):
     """
@@ -27,36 +29,40 @@ class LeakySine(nn.Module):
         return f"slope={self.slope}"
 
 
-def draw_dropout_mask(mask: th.Tensor, rate: float) -> None:
+def draw_dropout_mask(mask: th.Tensor, rate: float, kept: float = 1) -> None:
     """
-    Fill a mask of dropout: each element is 0 with probability ``rate``, otherwise ``1 / (1 - rate)``.
+    Fill a mask of dropout: each element is 0 with probability ``rate``, otherwise ``kept``.
 
-    At the small rates of DroQ the few gaps between dropped elements, which are geometric, are drawn in a sixth of the time
+    At the small rates of DroQ the few gaps between dropped elements, which are geometric, are drawn in a tenth of the time
     that one draw per element takes.
 
     :param mask: On the CPU, contiguous, of any shape
     :param rate: Above 0
+    :param kept: Value of what is not dropped
     """
     if rate > 0.1:
-        mask.bernoulli_(1 - rate).div_((1 - rate) or 1)
+        mask.bernoulli_(1 - rate).mul_(kept)
         return
-    elements = mask.fill_(1 / (1 - rate)).view(-1)
-    n_gaps = int(1.2 * rate * len(elements)) + 8  # enough for the whole mask, nearly always
-    last = -1
-    while last < len(elements):
-        dropped = last + th.empty(n_gaps, dtype=th.int64).geometric_(rate).cumsum(0)
-        elements[dropped[dropped < len(elements)]] = 0
-        last = int(dropped[-1])
+    elements = mask.fill_(kept).view(-1).numpy()
+    gaps = th.empty(int(1.2 * rate * elements.size) + 8, dtype=th.int64)  # enough for the whole mask, nearly always
+    position = -1
+    while position < elements.size:
+        position = zero_at_gaps(elements, gaps.geometric_(rate).numpy(), position)
 
 
 class Dropout(nn.Dropout):
     """That of torch, on the CPU with masks of :func:`draw_dropout_mask`."""
 
+    @property
+    def scale(self) -> float:
+        """What elements that are kept are multiplied with in training."""
+        return 1 / (1 - self.p) if self.p < 1 else 0.0
+
     def forward(self, x: th.Tensor) -> th.Tensor:
         if not self.training or self.p == 0 or x.device.type != "cpu":
             return super().forward(x)
         mask = th.empty(x.shape, dtype=x.dtype)
-        draw_dropout_mask(mask, self.p)
+        draw_dropout_mask(mask, self.p, self.scale)
         return x * mask
 
 

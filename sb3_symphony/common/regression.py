@@ -230,7 +230,9 @@ class FusedRegression(CriticRegression):
         for network in known:
             if network.fits(batch_size):
                 return network
-        network = FusedNetwork(critic.q_networks, batch_size, self.bfloat16)
+        others = (each for networks in self._networks.values() for each in networks)
+        lender = next((each for each in others if len(each.input) == batch_size), None)
+        network = FusedNetwork(critic.q_networks, batch_size, self.bfloat16, lender)
         self._networks[critic] = [network, *known[:1]]  # the actor's batch may have another size
         return network
 
