@@ -1,5 +1,6 @@
 """Statistics against hand-computed numbers, SciPy, and a slow bootstrap in plain Python."""
 
+import math
 import random
 
 import numpy as np
@@ -110,6 +111,12 @@ def test_bad_arguments(strata, arguments):
         bootstrap_interval(strata, **arguments)
 
 
+def test_nan_is_not_left_out():
+    assert np.isnan(iqm([1.0, 2.0, 3.0, math.nan]))
+    np.testing.assert_equal(iqm([[1.0, math.nan], [2.0, 2.0]], axis=1), [math.nan, 2.0])
+    assert unstable_episodes([100, 200], [[300.0, 300.0], [math.nan, 300.0]], Event(True, 100)) == (1, 2)
+
+
 def test_summary():
     summary = summarise([2, 4, 4, 4, 5, 5, 7, 9])
     assert (summary.n, summary.mean, summary.std, summary.iqm) == (8, 5.0, 2.0, 4.5)
@@ -126,14 +133,15 @@ STEPS = [100, 200, 300, 400, 500]
         ([0, 310, 290, 300, 301], Event(True, 400)),  # a single good one does not count
         ([300, 300, 0, 0, 0], Event(True, 100)),
         ([0, 400, 0, 400, 0], Event(False, 500)),
-        ([0, 0, 0, 0, 400], Event(False, 500)),
+        ([0, 0, 0, 0, 400], Event(False, 400)),  # it may have been at 500
     ],
 )
 def test_first_stable_evaluation(means, event):
     results = np.array(means)[:, None] + [-10, 0, 10]
     assert first_stable_evaluation(STEPS, results) == event
     assert first_stable_evaluation([], np.empty((0, 3))) == Event(False, 0)
-    assert first_stable_evaluation([100], [[400.0]]) == Event(False, 100)
+    assert first_stable_evaluation([100], [[400.0]]) == Event(False, 0)
+    assert first_stable_evaluation([100, 200], [[math.nan], [1.0]]) == Event(False, 200)
 
 
 def test_first_episode():

@@ -24,13 +24,14 @@ def iqm(values: ArrayLike, axis: int | None = None) -> np.ndarray:
 
     :param values: any shape, at least one value
     :param axis: axis to reduce; None: all values
-    :return: ``values`` without that axis
+    :return: ``values`` without that axis; NaN where one of them is
     """
     ordered = np.sort(np.asarray(values, dtype=np.float64), axis=axis)
     if axis is None:
         axis = 0  # np.sort has flattened
     n = ordered.shape[axis]
-    return np.take(ordered, range(n // 4, n - n // 4), axis=axis).mean(axis=axis)
+    middle = np.take(ordered, range(n // 4, n - n // 4), axis=axis).mean(axis=axis)
+    return np.where(np.isnan(np.take(ordered, -1, axis=axis)), np.nan, middle)  # sorted to the end
 
 
 def bootstrap_interval(
@@ -140,7 +141,7 @@ def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold:
     :param results: their returns, shape ``(n, episodes)``
     :param threshold: mean return to reach
     :param consecutive: number of evaluations that must reach it
-    :return: the event; censored at the last evaluation
+    :return: the event; censored at the last evaluation that cannot be the first of them
     """
     steps = np.asarray(timesteps, dtype=np.int64)
     if len(steps) == 0:
@@ -149,7 +150,8 @@ def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold:
     for first in range(len(steps) - consecutive + 1):
         if good[first : first + consecutive].all():
             return Event(True, int(steps[first]))
-    return Event(False, int(steps[-1]))
+    open_from = np.flatnonzero(~good)[-1] + 1 if not good.all() else 0  # good ones from here on: more might have followed
+    return Event(False, int(steps[open_from - 1]) if open_from else 0)
 
 
 def first_episode(steps: ArrayLike, returns: ArrayLike, threshold: float = 300.0, window: int = 1) -> Event:
@@ -190,7 +192,7 @@ def unstable_episodes(
         return 0, 0
     steps = np.asarray(timesteps, dtype=np.int64)
     counted = np.asarray(results, dtype=np.float64)[(steps > stable.step) & (steps <= stable.step + within)]
-    return int((counted < below).sum()), counted.size
+    return int((~(counted >= below)).sum()), counted.size  # NaN is a failure
 
 
 def median_event(steps: Sequence[int], reached: Sequence[bool]) -> tuple[float, bool]:

@@ -235,7 +235,8 @@ def _number(value: float) -> str:
 
 def _bound(bound: tuple[float, bool]) -> str:
     value, exact = bound
-    return f"{'' if exact else '> '}{_number(value)}"
+    half = value < 1000 and value % 1  # a median of episodes
+    return f"{'' if exact else '> '}{f'{value:.1f}' if half else _number(value)}"
 
 
 def _duration(seconds: float) -> str:
@@ -409,7 +410,7 @@ def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
         lines += [
             f"- S{name}: environment step of the first of two consecutive evaluations with mean return ≥ {name}",
             f"- E{name}: first training episode with return ≥ {name}; T{name}: first one at which the mean of the latest 100 "
-            f"is ≥ {name}. Median over seeds, in brackets the environment step",
+            f"is ≥ {name}. Median over seeds, in brackets that of the environment steps",
             '- "> n": the number depends on runs that ended before',
         ]
     if "unstable" in names:

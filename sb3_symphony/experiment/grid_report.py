@@ -48,7 +48,7 @@ def collect(study: Study, progress: Sequence[Progress], folder: Path, target: Pa
     folders = sorted({str(folder), *filter(os.path.isabs, recorded)}, key=len, reverse=True)
     contents = {path: path.read_bytes() for path in found}
     for path in found:
-        if path.suffix == ".yml":
+        if path.suffix in (".yml", ".json"):
             for name in folders:
                 contents[path] = contents[path].replace(f"{name}/".encode(), b"").replace(name.encode(), b".")
     for each in progress:
