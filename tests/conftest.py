@@ -1,6 +1,9 @@
 """Shared fixtures: small, fast models of all three algorithms."""
 
 import os
+
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")  # before torch looks: results are compared with those of the CPU
+
 import signal
 import subprocess
 from collections.abc import Callable, Iterator

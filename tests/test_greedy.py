@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import TransformReward
 from resume_helpers import assert_same_results
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import DQN, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -246,6 +246,20 @@ def test_fresh_episodes_of_a_resumed_run(tmp_path):
 def test_wrong_values(kwargs, error):
     with pytest.raises(error, match=next(iter(kwargs))):
         GreedyEpisodes(ALWAYS, **kwargs)
+
+
+def test_actions_may_be_discrete():
+    class GreedyDQN(ActsGreedily, DQN):
+        pass
+
+    env = make_vec_env("CartPole-v1", n_envs=2, seed=0)
+    model = GreedyDQN("MlpPolicy", env, learning_starts=20, exploration_fraction=1.0, exploration_final_eps=1.0, **SMALL)
+    model.learn(40, callback=GreedyEpisodes(ALWAYS))
+    greedy = model.predict(model._last_obs, deterministic=True)[0]
+    model.greedy_envs = np.array([True, True])
+    for _ in range(10):  # actions of chance without
+        actions, stored = model._sample_action(0, n_envs=2)
+        assert actions.tolist() == stored.tolist() == greedy.tolist()
 
 
 def test_needs_an_algorithm_that_can():

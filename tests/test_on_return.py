@@ -7,6 +7,7 @@ from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from sb3_symphony import REDQ, Symphony
 from sb3_symphony.common.callbacks import EntropyOnReturn, GreedyEpisodes, QuietOnReturn, SlowOnReturn
@@ -259,6 +260,16 @@ def test_refuses_other_noise():
     for other in (model, TD3("MlpPolicy", Returns(), device="cpu"), PPO("MlpPolicy", Returns(), device="cpu")):
         with pytest.raises(TypeError, match="expected a StickyActionNoise"):
             other.learn(3, callback=QuietOnReturn((0, 1)))
+
+
+@pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, EntropyOnReturn, GreedyEpisodes])
+def test_needs_returns(callback):
+    """SB3 puts no monitor around what is a VecEnv already."""
+    env, made = DummyVecEnv([Returns]), callback((50, 250), **NEEDED.get(callback, {}))
+    with pytest.raises(ValueError, match=f"{callback.__name__}: expected an environment with a Monitor"):
+        td3(env).learn(10, callback=made)
+    if callback is SlowOnReturn:
+        td3(VecMonitor(env)).learn(10, callback=made)
 
 
 @pytest.mark.parametrize("callback", [QuietOnReturn, SlowOnReturn, EntropyOnReturn, GreedyEpisodes])

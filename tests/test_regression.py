@@ -12,7 +12,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_symphony import REDQ, Symphony
-from sb3_symphony.common.layers import LeakySine
+from sb3_symphony.common.ensembles import EnsembleCritic
+from sb3_symphony.common.layers import LeakySine, StackedLinear
 from sb3_symphony.common.losses import CRITIC_LOSSES
 from sb3_symphony.common.regression import CriticRegression, FusedRegression, has_bfloat16, make_regression, not_fusable
 from sb3_symphony.redq.policies import REDQPolicy
@@ -408,6 +409,108 @@ def test_another_optimizer_is_used(optimizer, kwargs):
         run(fitter, 20, first=5)
     for a, b in zip(fitters[0].critic.parameters(), fitters[1].critic.parameters(), strict=True):
         th.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("n_groups", [1, 2])
+def test_groups_of_parameters_keep_their_own_options(n_groups):
+    """Biases alone are learned; or weights too, and those decay."""
+    fitters = pair()
+    for fitter in fitters:
+        run(fitter, 5)
+        biases = [parameter for parameter in fitter.critic.q_networks.parameters() if parameter.shape[1] == 1]
+        weights = [parameter for parameter in fitter.critic.q_networks.parameters() if parameter.shape[1] > 1]
+        groups = [{"params": biases}, {"params": weights, "weight_decay": 0.5}][:n_groups]
+        fitter.critic.optimizer = th.optim.AdamW(groups, lr=1e-2, weight_decay=0.0, fused=True)
+        run(fitter, 10, first=5)
+    for a, b in zip(fitters[0].critic.parameters(), fitters[1].critic.parameters(), strict=True):
+        th.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_replaced_layers_and_parameters_are_used(whole):
+    """The last layer is reset now and then, against early overfitting."""
+    fitters = pair()
+    for fitter in fitters:
+        for i in range(3):
+            run(fitter, 4, first=4 * i)
+            for critic in (fitter.critic, fitter.critic_target):
+                layers = critic.q_networks.layers
+                th.manual_seed(i)
+                fresh = StackedLinear(*layers[-1].weight.shape).to(layers[-1].weight)
+                if whole:
+                    layers[-1] = fresh
+                else:
+                    layers[-1].weight, layers[-1].bias = fresh.weight, fresh.bias
+            fitter.critic.optimizer = th.optim.Adam(fitter.critic.parameters(), lr=1e-2, fused=True)
+        run(fitter, 4, first=12)
+    assert_equal_states(*fitters)
+
+
+def test_memory_is_lent_to_what_has_the_same_shapes_and_precision_only():
+    fitter = regression("fused")
+    observations, actions, target = batch_of(24)
+    run(fitter, 2)
+    fitter.target_q_values(observations, actions)
+    for critic in (fitter.critic, fitter.critic_target):
+        critic.double() if critic.q_networks.layers[0].weight.dtype == th.float32 else critic.float()
+    fitter.critic.optimizer = th.optim.Adam(fitter.critic.parameters(), fused=True)
+    other = fitter.critic.q_networks.layers[0].weight.dtype
+    batch = [each.to(other) for each in (observations, actions, target)]
+    assert fitter.target_q_values(*batch[:2]).dtype == fitter.fit(*batch, TAU).loss.dtype == other
+
+
+class Sevens(EnsembleCritic):
+    def outputs(self, obs, actions, members=None):
+        return super().outputs(obs, actions, members) * 0 + 7
+
+
+@pytest.mark.parametrize("cls", [REDQ, Symphony])
+def test_critics_of_another_class_are_asked(small, cls):
+    model = small(cls)
+    for critic in (model.critic, model.critic_target):
+        critic.__class__ = Sevens
+    with pytest.raises(ValueError, match="the critic is Sevens, not EnsembleCritic"):
+        make_regression(model.critic, model.critic_target, "mse", "independent", "fused")
+    model._create_regression()
+    assert type(model._regression) is CriticRegression
+    fused = FusedRegression(model.critic, model.critic_target, "mse", "independent")
+    for name in ("q_values", "target_q_values"):
+        assert getattr(fused, name)(th.zeros(4, 3), th.zeros(4, 1)).unique().tolist() == [7.0]
+
+
+def test_wrapped_step_and_module_hooks_are_called():
+    observations, actions, target = batch_of(8)
+    fitter, calls = regression("fused"), []
+    optimizer, step = fitter.critic.optimizer, fitter.critic.optimizer.step
+    optimizer.step = lambda *args: calls.append("step") or step(*args)
+    fitter.fit(observations, actions, target, TAU)
+    del optimizer.step
+    hooks = [
+        each.q_networks.register_forward_hook(lambda *_: calls.append("forward"))
+        for each in (fitter.critic, fitter.critic_target)
+    ]
+    fitter.fit(observations, actions, target, TAU)
+    fitter.q_values(observations, actions)
+    fitter.target_q_values(observations, actions)
+    for hook in hooks:
+        hook.remove()
+    fitter.fit(observations, actions, target, TAU)
+    assert calls == ["step", "forward", "forward", "forward"]
+
+
+def test_dropout_that_falls_to_nothing():
+    fitters = pair(dropout_rate=0.1)
+
+    def on_update(i, fitter):
+        for critic in (fitter.critic, fitter.critic_target):
+            for layer in critic.q_networks.layers:
+                if isinstance(layer, nn.Dropout):
+                    layer.p = max(0.0, 0.1 - 0.02 * i)
+
+    for fitter in fitters:
+        th.manual_seed(1)
+        run(fitter, 10, on_update=on_update)
+    assert_equal_states(*fitters)
 
 
 def test_weights_from_a_vector():

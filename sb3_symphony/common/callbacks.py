@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecMonitor, is_vecenv_wrapped
 
 from sb3_symphony.common.checks import check_number, check_pair
 from sb3_symphony.common.noise import StickyActionNoise
@@ -23,7 +25,7 @@ class _OnReturn(BaseCallback):
     :param n_episodes: how many episodes are recent
     :param verbose: see SB3
     :raises ValueError: if a number is out of range or returns do not rise; at the start of training, if the model keeps fewer
-        episodes (``stats_window_size``)
+        episodes (``stats_window_size``), or nothing tells what they return (no ``Monitor``, no ``VecMonitor``)
     """
 
     def __init__(self, returns: tuple[float, float], n_episodes: int, verbose: int) -> None:
@@ -39,6 +41,9 @@ class _OnReturn(BaseCallback):
         kept = self.model._stats_window_size
         if self.n_episodes > kept:
             raise ValueError(f"n_episodes={self.n_episodes!r}: expected at most the model's stats_window_size, {kept}")
+        env = self.training_env
+        if not is_vecenv_wrapped(env, VecMonitor) and not all(env.env_is_wrapped(Monitor)):
+            raise ValueError(f"{type(self).__name__}: expected an environment with a Monitor, which tells returns")
 
     def _on_step(self) -> bool:
         if (recent := self._recent()) is not None:

@@ -3,6 +3,7 @@
 import difflib
 import inspect
 import math
+import operator
 from collections.abc import Iterable
 from typing import Any
 
@@ -28,7 +29,10 @@ def check_number(
     bounds = f" {'>' if exclusive else '>='} {low:g}" if low > -math.inf else ""
     bounds += f"{' and' if bounds else ''} <= {high:g}" if high < math.inf else ""
     message = f"{name}={value!r}: expected {kind}{bounds}"
-    number = int(value) if hasattr(value, "__index__") else value
+    try:
+        number: Any = operator.index(value)  # of NumPy's integers too
+    except TypeError:
+        number = value
     if isinstance(value, bool) or not isinstance(number, int if integer else (int, float, np.floating)):
         raise TypeError(message)
     if not math.isfinite(number) or not low <= number <= high or (exclusive and number == low):

@@ -6,9 +6,10 @@ networks of this size that costs more than the matrix products. Here torch makes
 :mod:`~sb3_symphony.common.kernels` do what lies between them.
 """
 
-from collections.abc import Callable, Iterator
+import operator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -72,6 +73,16 @@ def uncovered(network: StackedMLP) -> str | None:
     """The first layer that has no hand-written passes, ``None`` if all have."""
     known = (StackedLinear, StackedLayerNorm, Dropout)
     return next((type(m).__name__ for m in network.layers if type(m) not in known and activation_of(m) is None), None)
+
+
+def parameters_of(network: StackedMLP) -> list[nn.Parameter]:
+    """The same as ``network.parameters()``, in a fifth of the time."""
+    return [parameter for layer in network.layers for parameter in layer._parameters.values() if parameter is not None]
+
+
+def are_same(objects: Sequence[Any], others: Sequence[Any]) -> bool:
+    """Whether two lists hold the very same objects."""
+    return len(objects) == len(others) and all(map(operator.is_, objects, others))
 
 
 def array(tensor: th.Tensor) -> np.ndarray:
@@ -248,11 +259,12 @@ class Hidden(Layer):
         self.input = x.expand(n, -1, -1)
         self.products.forward(self.input, members, self.product[:n])
         if self.dropout is not None:
-            if self.dropout.training:
+            drops = self.dropout.training and self.dropout.p > 0
+            if drops:
                 draw_dropout_mask(self.mask[:n], self.dropout.p)
             else:
                 self.mask.fill_(1)
-            self._kept = self._real(self.dropout.scale if self.dropout.training else 1)
+            self._kept = self._real(self.dropout.scale if drops else 1)
         self._forward(members, self._kept)
         out = self.out[:n]
         return out if self.activation.forward is None else self.activation.forward(out)
@@ -335,13 +347,14 @@ class FusedNetwork:
     def __init__(
         self, network: StackedMLP, batch_size: int, bfloat16: bool = False, lender: "FusedNetwork | None" = None
     ) -> None:
-        first = network.layers[0]
+        self._layers = list(network.layers)
+        first = self._layers[0]
         assert isinstance(first, StackedLinear)
         n_members, in_features, _ = first.weight.shape
         self.input = first.weight.new_empty(batch_size, in_features).detach()
         self.hidden: list[Hidden] = []
 
-        modules = list(network.layers)
+        modules = list(self._layers)
         while len(modules) > 1:
             linear, following = modules.pop(0), modules.pop(0)
             dropout = norm = None
@@ -367,6 +380,15 @@ class FusedNetwork:
         """Whether the workspaces have this batch size, and the parameters are still where they were."""
         here = [parameter.data_ptr() for parameter in self.parameters]
         return len(self.input) == batch_size and here == self._addresses
+
+    def resembles(self, network: StackedMLP) -> bool:
+        """Whether a network's layers are of the same kinds and shapes, in the precision of these workspaces."""
+        others = parameters_of(network)
+        return (
+            [type(layer) for layer in self._layers] == [type(layer) for layer in network.layers]
+            and [parameter.shape for parameter in self.parameters] == [parameter.shape for parameter in others]
+            and {self.input.dtype} == {parameter.dtype for parameter in others}
+        )
 
     def forward(self, features: th.Tensor, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
         """

@@ -69,7 +69,8 @@ class ActsGreedily(OffPolicyAlgorithm):
         assert self._last_obs is not None
         greedy, _ = self.predict(self._last_obs, deterministic=True)
         action[self.greedy_envs] = greedy[self.greedy_envs]
-        buffer_action[self.greedy_envs] = self.policy.scale_action(greedy)[self.greedy_envs]
+        scaled = self.policy.scale_action(greedy) if isinstance(self.action_space, spaces.Box) else greedy
+        buffer_action[self.greedy_envs] = scaled[self.greedy_envs]
         return action, buffer_action
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import get_parameters_by_name, polyak_update
 from torch.autograd.function import once_differentiable
 
 from sb3_symphony.common.ensembles import EnsembleCritic, StackedMLP
-from sb3_symphony.common.fused import FusedNetwork, array, uncovered
+from sb3_symphony.common.fused import FusedNetwork, are_same, array, parameters_of, uncovered
 from sb3_symphony.common.kernels import adam_polyak
 from sb3_symphony.common.losses import CRITIC_LOSS_SLOPES, CRITIC_LOSSES, ValueBins
 
@@ -172,15 +172,14 @@ class FusedRegression(CriticRegression):
     ) -> None:
         super().__init__(critic, critic_target, loss, reduction)
         self.bfloat16 = bfloat16
-        self._optimizer = critic.optimizer  # that these passes stand in for
-        self._parameters, self._targets = (list(each.q_networks.parameters()) for each in (critic, critic_target))
+        self._checked: dict[EnsembleCritic, tuple[list[Any], bool]] = {}  # its parts, and whether they can be fused
         self._networks: dict[EnsembleCritic, list[FusedNetwork]] = {}
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
         # Network, addresses of the optimiser's state and of the targets, all of them in the sweeps
         self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_networks": {}, "_sweeps": [], "_swept": (None, [])}  # made again at the next call
+        return {**vars(self), "_checked": {}, "_networks": {}, "_sweeps": [], "_swept": (None, [])}  # made again when needed
 
     def fit(
         self,
@@ -190,7 +189,7 @@ class FusedRegression(CriticRegression):
         tau: float,
         weights: th.Tensor | None = None,
     ) -> Fit:
-        if self._customised():
+        if self._customised(self.critic):
             return super().fit(observations, actions, target, tau, weights)
         with th.no_grad():
             network = self._network(self.critic, len(actions))
@@ -203,26 +202,42 @@ class FusedRegression(CriticRegression):
             return Fit(loss.sum(), q_values)
 
     def q_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        if self._customised(self.critic):
+            return super().q_values(observations, actions)
         with th.no_grad():
             features = self.critic.extract_features(observations, self.critic.features_extractor)
         return _QValues.apply(actions, features, self._network(self.critic, len(actions)), self.objective)
 
     def target_q_values(self, observations: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
+        if self._customised(self.critic_target):
+            return super().target_q_values(observations, actions, members)
         with th.no_grad():
             features = self.critic_target.extract_features(observations, self.critic_target.features_extractor)
             outputs = self._network(self.critic_target, len(actions)).forward(features, actions, members)
             return self.objective.values(outputs)
 
-    def _customised(self) -> bool:
-        """Whether layers are frozen, there are hooks (to clip gradients), or the optimiser is another: autograd's business."""
-        optimizer = self.critic.optimizer
-        if optimizer is not self._optimizer:
-            if not_fusable(self.critic) is not None:
-                return True
-            self._optimizer = optimizer
-        hooks = optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks
-        return bool(hooks) or any(
-            not each.requires_grad or each._backward_hooks or each._post_accumulate_grad_hooks for each in self._parameters
+    def _customised(self, critic: EnsembleCritic) -> bool:
+        """
+        Whether something was replaced that cannot be fused, a layer is frozen, or there are hooks (to clip gradients, say):
+        autograd's business.
+        """
+        parts, optimizer = _parts(critic), _optimizer_of(critic)
+        known, fusable = self._checked.get(critic, ([], False))
+        if not are_same(parts, known):
+            fusable = not_fusable(critic) is None
+            self._checked[critic] = parts, fusable
+            self._networks.pop(critic, None)  # passes of what was replaced
+        if not fusable:
+            return True
+        modules = (critic, critic.q_networks, *critic.q_networks.layers)
+        if any(m._forward_hooks or m._forward_pre_hooks or m._backward_hooks or m._backward_pre_hooks for m in modules):
+            return True
+        if optimizer is None:
+            return False
+        wrapped = "step" in vars(optimizer) or optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks
+        return bool(wrapped) or any(
+            not each.requires_grad or each._backward_hooks or each._post_accumulate_grad_hooks
+            for each in optimizer.param_groups[0]["params"]
         )
 
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
@@ -230,9 +245,9 @@ class FusedRegression(CriticRegression):
         for network in known:
             if network.fits(batch_size):
                 return network
-        others = (each for networks in self._networks.values() for each in networks)
-        lender = next((each for each in others if len(each.input) == batch_size), None)
-        network = FusedNetwork(critic.q_networks, batch_size, self.bfloat16, lender)
+        others = (each for owner, networks in self._networks.items() if owner is not critic for each in networks)
+        lenders = (each for each in others if len(each.input) == batch_size and each.resembles(critic.q_networks))
+        network = FusedNetwork(critic.q_networks, batch_size, self.bfloat16, next(lenders, None))
         self._networks[critic] = [network, *known[:1]]  # the actor's batch may have another size
         return network
 
@@ -240,15 +255,16 @@ class FusedRegression(CriticRegression):
         """Adam and Polyak of all parameters, whose state is kept where torch's optimiser keeps it."""
         optimizer = self.critic.optimizer
         states = [optimizer.state[parameter] for parameter in network.parameters]
+        targets = parameters_of(self.critic_target.q_networks)
         for parameter, state in zip(network.parameters, states, strict=True):
             if not state:  # as Adam itself does at a parameter's first step
                 state["step"] = th.zeros((), dtype=th.float32)
                 state.update(exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter))
-        addresses = [state["exp_avg"].data_ptr() for state in states] + [target.data_ptr() for target in self._targets]
+        addresses = [state["exp_avg"].data_ptr() for state in states] + [target.data_ptr() for target in targets]
         if network is not self._swept[0] or addresses != self._swept[1]:  # another batch size; what was loaded lies elsewhere
             self._swept = (network, addresses)
             self._sweeps = []
-            for parameter, grad, state, target in zip(network.parameters, network.grads, states, self._targets, strict=True):
+            for parameter, grad, state, target in zip(network.parameters, network.grads, states, targets, strict=True):
                 tensors = (parameter, grad, state["exp_avg"], state["exp_avg_sq"], state["step"], target)
                 self._sweeps.append(partial(adam_polyak, *(array(tensor).reshape(-1) for tensor in tensors)))
 
@@ -258,26 +274,48 @@ class FusedRegression(CriticRegression):
             sweep(group["lr"], *group["betas"], group["eps"], group["weight_decay"], decoupled, tau)
 
 
+def _optimizer_of(critic: EnsembleCritic) -> th.optim.Optimizer | None:
+    """Targets have none."""
+    return getattr(critic, "optimizer", None)
+
+
+def _parts(critic: EnsembleCritic) -> list[Any]:
+    """All that :func:`not_fusable` looks at and that may be replaced."""
+    optimizer, network = _optimizer_of(critic), critic.q_networks
+    groups = [] if optimizer is None else optimizer.param_groups
+    held = [parameter for group in groups for parameter in group["params"]]
+    inner = [*network.layers, *parameters_of(network)] if isinstance(network, StackedMLP) else []
+    return [critic.features_extractor, network, *inner, optimizer, *groups, *held]
+
+
 def not_fusable(critic: EnsembleCritic) -> str | None:
     """
     Why critics cannot be fitted by :class:`FusedRegression`.
 
-    :param critic: The critics
+    :param critic: The critics, or their targets
     :return: A reason, or ``None`` if they can
     """
-    optimizer = critic.optimizer
+    optimizer = _optimizer_of(critic)
     if critic.device.type != "cpu":
         return f"the device is {critic.device}, not the CPU"
+    if type(critic) is not EnsembleCritic:  # a subclass may compute something else
+        return f"the critic is {type(critic).__name__}, not EnsembleCritic"
     if type(critic.features_extractor) is not FlattenExtractor:
         return f"the features extractor is {type(critic.features_extractor).__name__}, not FlattenExtractor"
-    if type(critic.q_networks) is not StackedMLP:  # a subclass may compute something else
+    if type(critic.q_networks) is not StackedMLP:
         return f"the networks are {type(critic.q_networks).__name__}, not StackedMLP"
     if (layer := uncovered(critic.q_networks)) is not None:
         return f"no hand-written passes for {layer}"
+    if optimizer is None:
+        return None
     if type(optimizer) not in (th.optim.Adam, th.optim.AdamW):
         return f"the optimizer is {type(optimizer).__name__}, not Adam or AdamW"
     if not optimizer.defaults["fused"]:
         return f"the optimizer has fused={optimizer.defaults['fused']}"
+    if len(optimizer.param_groups) > 1:
+        return f"the optimizer has {len(optimizer.param_groups)} groups of parameters"
+    if not are_same(optimizer.param_groups[0]["params"], parameters_of(critic.q_networks)):
+        return "the optimizer's parameters are not those of the critics"
     special = [name for name in ("amsgrad", "maximize", "capturable", "differentiable") if optimizer.defaults[name]]
     return f"the optimizer has {special[0]}=True" if special else None
 

@@ -56,7 +56,8 @@ class Actor(TD3Actor):
     def before_tanh(self, obs: PyTorchObs) -> th.Tensor:
         """
         :param obs: Observations
-        :return: What ``forward`` takes the tangens hyperbolicus of, ``(batch, n_actions)``
+        :return: What ``forward`` takes the tangens hyperbolicus of, ``(batch, n_actions)``. The actor's step goes through
+            this one: who overrides one of them has to override both
         """
         return self.mu[:-1](self.extract_features(obs, self.features_extractor))
 
