@@ -1,5 +1,7 @@
 """Files of runs, as arrays."""
 
+from collections import OrderedDict
+
 import numpy as np
 import pytest
 import yaml
@@ -62,6 +64,12 @@ def test_time_of_a_resumed_run_goes_on(tmp_path):
 def test_successes(tmp_path):
     write_monitor(tmp_path / "0.monitor.csv", 0.0, [(1, 10, 1.0, True), (1, 10, 2.0, False)], "r,l,t,is_success")
     np.testing.assert_array_equal(read_episodes(tmp_path).successes, [1.0, 0.0])
+
+
+def test_successes_as_numbers(tmp_path):
+    """As environments for grasping tell them."""
+    write_monitor(tmp_path / "0.monitor.csv", 0.0, [(-50, 50, 1, 0.0), (-20, 50, 2, 1.0), (-20, 50, 3, 1)], "r,l,t,is_success")
+    np.testing.assert_array_equal(read_episodes(tmp_path).successes, [0.0, 1.0, 1.0])
 
 
 def test_no_episode_yet(tmp_path):
@@ -130,7 +138,7 @@ def test_folders_of_rl_zoo_are_read(tmp_path):
         text = "!!python/object/apply:collections.OrderedDict\n- - - algo\n    - ppo\n"
         (path / "CartPole-v1" / name).write_text(text)
     run = open_run(path)
-    assert (run.algo, run.env, run.seed, run.config) == ("ppo", "CartPole-v1", None, {})
+    assert (run.algo, run.env, run.seed, run.config) == ("ppo", "CartPole-v1", None, {"algo": "ppo"})
 
 
 def test_a_tensorboard_log_alone(tmp_path):
@@ -193,6 +201,18 @@ def test_runs_that_start_elsewhere_are_another_group(tmp_path):
         [4],
         [5],
     ]
+
+
+def test_groups_of_rl_zoo_are_told_apart_too(tmp_path):
+    for number, rate in enumerate((0.001, 0.0001), 1):
+        path = make_run(tmp_path, number=number)
+        config = OrderedDict(learning_rate=rate, n_timesteps=100)
+        (path / "X-v0" / "config.yml").write_text(yaml.dump(config))
+        (path / "X-v0" / "args.yml").write_text(yaml.dump(OrderedDict(algo="sac", env="X-v0", seed=number)))
+        assert "OrderedDict" in (path / "X-v0" / "config.yml").read_text()
+    runs = find_runs(tmp_path, [], [])
+    assert [(run.config["learning_rate"], run.seed) for run in runs] == [(0.001, 1), (0.0001, 2)]
+    assert [len(group.runs) for group in group_runs(runs)] == [1, 1]
 
 
 def test_groups_are_told_apart_by_what_differs(tmp_path):

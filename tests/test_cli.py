@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_symphony.cli import main
+from sb3_symphony.cli import main, make_parser
 from sb3_symphony.experiment.config import TrainOptions
 from sb3_symphony.experiment.registry import ALGORITHMS
 
@@ -217,6 +217,17 @@ def test_output_that_has_no_such_characters():
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run([sys.executable, "-m", "sb3_symphony", "train", "--help"], env=environment, capture_output=True)
     assert done.returncode == 0 and done.stderr == b"" and b"?" in done.stdout
+
+
+def test_negative_numbers_may_have_exponents():
+    arguments = make_parser().parse_args(["train", "--threshold", "-1.2e3"])
+    assert arguments.threshold == -1200
+
+
+def test_warnings_of_gymnasium_are_no_second_line(folder):
+    command = [sys.executable, "-m", "sb3_symphony", "train", "--algo", "sac", "--env", "Pendulum", "-n", "10"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "did you mean 'Pendulum-v1'?" in done.stderr
 
 
 def test_settings_of_an_algorithm_in_a_file(folder, capsys):

@@ -170,6 +170,13 @@ def test_action_delay():
         assert actions[:, 1] == pytest.approx([0.5, 0.5, 1.5, 1.5, 1.5, 1.5])  # zero is not allowed, 0.5 is nearest
 
 
+def test_a_delay_that_nothing_outlasts_takes_no_memory():
+    env = ActionDelay(gym.make("Echo-v0", disable_env_checker=True), steps=10**12)
+    env.reset(seed=0)
+    env.step(np.array([0.7, 1.0], np.float32))
+    assert env.unwrapped.actions[0] == pytest.approx([0, 0.5])
+
+
 def test_no_delay_changes_nothing():
     env = ActionDelay(gym.make("Echo-v0", disable_env_checker=True), steps=0)
     env.reset(seed=0)

@@ -53,6 +53,12 @@ def test_results_are_told_if_they_cannot_be_written(folder, monkeypatch, capsys)
     assert json.loads(capsys.readouterr().out) == {"mean_reward": 3} and not list(folder.iterdir())
 
 
+def test_json_has_null_for_what_is_not_finite(capsys):
+    with report("-") as tell:
+        tell({"a": [1.0, float("nan")], "b": {"c": (float("inf"), 2)}})
+    assert json.loads(capsys.readouterr().out) == {"a": [1.0, None], "b": {"c": [None, 2]}}
+
+
 def test_bad_names(folder):
     (folder / "file").touch()
     for call, message in (

@@ -80,6 +80,8 @@ def texts(axes):
 
 def test_running_mean():
     np.testing.assert_allclose(running_mean(np.array([1.0, 2.0, 3.0, 4.0]), 2), [1.0, 1.5, 2.5, 3.5])
+    known = running_mean(np.array([1.0, 2.0, np.nan, 4.0, 5.0, 6.0]), 2)
+    np.testing.assert_array_equal(known, [1.0, 1.5, np.nan, np.nan, 4.5, 5.5])
 
 
 def test_block_mean():

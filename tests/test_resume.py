@@ -17,9 +17,11 @@ import pytest
 import yaml
 from filelock import FileLock
 from resume_helpers import GlobalRandomEnv, assert_same_results, difference, monitor_rows
+from stable_baselines3 import TD3
 from stable_baselines3.common.logger import Logger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sb3_symphony.analysis.runs import open_run
 from sb3_symphony.cli import main
 from sb3_symphony.common.checkpoint import ExactCheckpoints, newest_checkpoint
 from sb3_symphony.experiment.config import ConfigError, TrainOptions
@@ -243,6 +245,22 @@ def test_tensorboard_goes_on_in_its_folder(killed, folder):
     assert [step for step, _ in scalars("tb_b")["rollout/ep_len_mean"]] == [200, 400]
 
 
+def test_a_copy_has_a_log_of_its_own(folder):
+    run = train(options(log_folder="b", tensorboard_log="tb", n_timesteps=450, save_freq=150, eval_freq=60, keep=5)).run.path
+    copy = run.with_name("Pendulum-v1_2")
+    shutil.copytree(run, copy)
+    (copy / "Pendulum-v1.zip").unlink()
+    for path in (copy / "checkpoints").glob("*450*"):
+        path.unlink()
+    log = folder / "tb" / "Pendulum-v1"
+    before = contents(log / "TD3_1")
+    resume(copy)
+    assert contents(log / "TD3_1") == before and {path.name for path in log.iterdir()} == {"TD3_1", "TD3_2"}
+    events = EventAccumulator(str(log / "TD3_2")).Reload()
+    assert [event.step for event in events.Scalars("eval/mean_reward")] == [360, 420]
+    assert open_run(copy).log.samefile(log / "TD3_2") and open_run(run).log.samefile(log / "TD3_1")
+
+
 def test_tensorboard_goes_on_where_the_run_is_moved_to(killed, folder):
     log = "b/td3/Pendulum-v1_1/log"
     run = killed(415, options(log_folder="b", tensorboard_log=log, n_timesteps=450, save_freq=150, eval_freq=60))
@@ -281,6 +299,25 @@ def test_other_checkpoint_flags_may_differ(killed):
     assert_same_results(whole, run)
     steps = sorted(int(path.stem.rpartition("_")[2]) for path in (run / "checkpoints").glob("*.ckpt"))
     assert steps == [210, 225, 240, 255, 260]
+
+
+def test_forced_to_stop_before_the_first_checkpoint(monkeypatch, capsys):
+    """By two Ctrl-C, say: what was learned by then is kept as a model of its steps."""
+    whole = train(options(log_folder="a", eval_freq=60)).run.path
+    with monkeypatch.context() as patch:
+
+        def force(self):
+            if self.num_timesteps == 90:
+                raise KeyboardInterrupt
+            return True
+
+        patch.setattr(ExactCheckpoints, "_on_step", force)
+        result = train(options(log_folder="b", eval_freq=60))
+    assert result.interrupted and result.run.model.is_file()
+    resume(result.run.path)
+    assert "stopped before its first checkpoint, begins again" in capsys.readouterr().out
+    assert_same_results(whole, result.run.path)
+    assert TD3.load(result.run.path / "rl_model_90_steps.zip").num_timesteps == 90
 
 
 def test_killed_before_the_first_checkpoint(killed, capsys):

@@ -176,6 +176,17 @@ def test_statistics_of_vec_normalize_come_along(folder):
         train(options("ppo", hyperparams=small, trained_agent="elsewhere.zip"))
 
 
+def test_rewards_alone_were_normalised():
+    small = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 64, "batch_size": 16, "normalize": {"norm_obs": False}}
+    first = train(options("ppo", hyperparams=small)).run
+    result = train(options("ppo", hyperparams=small, trained_agent=str(first.path))).run
+    env = make_training_env("Pendulum-v1", RunSettings(n_timesteps=1), None, 0)
+    before, after = (VecNormalize.load(str(run.normalization), env).ret_rms.count for run in (first, result))
+    assert after == pytest.approx(2 * before, rel=0.05)
+    with pytest.raises(ConfigError, match=r"-i: .* was trained without norm_obs — expected normalize: {norm_obs: false}"):
+        train(options("ppo", hyperparams={**small, "normalize": True}, trained_agent=str(first.path)))
+
+
 @pytest.mark.parametrize("algo", ["td3", "symphony", "redq"])
 @pytest.mark.parametrize("size", [1000, 60])
 def test_experience_comes_along(algo, size):

@@ -4,11 +4,13 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from gymnasium.envs.classic_control import PendulumEnv
 from stable_baselines3 import PPO, SAC, TD3
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -253,6 +255,22 @@ def test_errors_while_learning_keep_their_traceback(monkeypatch):
     monkeypatch.setattr(TD3, "train", broken)
     with pytest.raises(ValueError, match="a defect"):
         main("train --algo td3 --env Pendulum-v1 -n 100 --eval-freq 0 -params learning_starts:10 buffer_size:100".split())
+
+
+def test_errors_while_learning_cost_no_model(monkeypatch, capsys):
+    """Of a robot that stumbles in the middle of a training."""
+    step, steps = PendulumEnv.step, []
+
+    def stumble(self, action):
+        steps.append(action)
+        return step(self, action) if len(steps) <= 70 else 1 / 0
+
+    monkeypatch.setattr(PendulumEnv, "step", stumble)
+    with pytest.raises(ZeroDivisionError):
+        train(options())
+    (run,) = find_runs(Path("logs"), [], [])
+    assert TD3.load(run.path / "Pendulum-v1.zip").num_timesteps == 70
+    assert capsys.readouterr().err == f"note: saved {run.path / 'Pendulum-v1.zip'}, of 70 steps\n"
 
 
 def test_stopping_during_an_evaluation(monkeypatch):

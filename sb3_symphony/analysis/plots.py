@@ -95,12 +95,13 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     """
     :param values: shape ``(n,)``
     :param window: number of values in a mean, fewer at the start
-    :return: trailing means, shape ``(n,)``
+    :return: trailing means, shape ``(n,)``; NaN where one of the values is
     """
-    sums = np.concatenate([[0.0], np.cumsum(values)])
+    unknown = np.isnan(values)
+    sums, unknowns = (np.concatenate([[0], np.cumsum(each)]) for each in (np.where(unknown, 0.0, values), unknown))
     last = np.arange(1, len(values) + 1)
     first = np.maximum(last - window, 0)
-    return (sums[last] - sums[first]) / (last - first)
+    return np.where(unknowns[last] > unknowns[first], np.nan, (sums[last] - sums[first]) / (last - first))
 
 
 def block_mean(values: np.ndarray, size: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import logging
 import os
 import re
 import zipfile
@@ -13,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import yaml
+
+from sb3_symphony.common.plain_yaml import PlainLoader
 
 
 class Damaged(ValueError):
@@ -113,8 +116,9 @@ def _monitor_rows(rows: csv.DictReader, start: float) -> Iterator[tuple[float, f
     for row in rows:
         try:
             seconds, result = float(row["t"]), (float(row["r"]), int(row["l"]))
-            success = {"True": 1.0, "False": 0.0, "": np.nan, None: np.nan}[row.get("is_success")]
-        except (TypeError, ValueError, KeyError):
+            told = row.get("is_success") or "nan"
+            success = float({"True": 1, "False": 0}.get(told, told))
+        except (TypeError, ValueError):
             continue
         if seconds < before:  # a resumed run counts from zero again
             pause += before
@@ -150,6 +154,7 @@ def read_scalars(folder: Path) -> dict[str, Scalar]:
     """
     from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of what a resumed run has marked as void
     events = EventAccumulator(str(folder), size_guidance={SCALARS: 0}).Reload()
     scalars = {}
     start = events.FirstEventTimestamp() if events.Tags()["scalars"] else 0.0
@@ -228,10 +233,10 @@ class Run:
 
 
 def _plain_mapping(path: Path) -> dict[str, Any]:
-    """A YAML mapping of plain values; empty if it is none (RL Zoo's files hold Python objects)."""
+    """A YAML mapping of plain values; empty if it is none."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=PlainLoader)
+    except (OSError, yaml.YAMLError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -309,6 +309,7 @@ class ExactCheckpoints(BaseCallback):
             self.folder.mkdir(parents=True, exist_ok=True)
             state = training_state(model)
             state["rollout follows"] = rollout_follows
+            state["folder"] = os.path.abspath(self.folder)
             log_folder = model.logger.get_dir()
             state["log folder"] = None if log_folder is None else os.path.abspath(log_folder)
             state["callbacks"] = {key: _attributes(callback) for key, callback in self._named_callbacks()}

@@ -9,7 +9,6 @@ Stable-Baselines3.
 
 import ast
 import difflib
-import re
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
 
 from sb3_symphony.common.checks import suggestion
+from sb3_symphony.common.plain_yaml import PlainLoader
 from sb3_symphony.experiment.registry import ALGORITHMS, is_file, without_module
 
 
@@ -52,37 +52,6 @@ def reason(error: Exception) -> str:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML 1.1 without objects or keys twice, and with ``1e-3`` and ``1e6`` as numbers (PyYAML wants a dot in them)."""
-
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        node = super().compose_mapping_node(anchor)
-        seen = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode):
-                if (key.tag, key.value) in seen:
-                    raise yaml.composer.ComposerError(None, None, f"'{key.value}' is there twice", key.start_mark)
-                seen.add((key.tag, key.value))
-        return node
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d[\d_]*(\.[\d_]*)?[eE][-+]?\d+$"), list("-+0123456789")
-)
-
-
-def _ordered_mapping(loader: yaml.SafeLoader, node: yaml.Node) -> dict[str, Any]:
-    """RL Zoo tags the mapping of a ``config.yml`` as an ``OrderedDict``: its pairs are read as a plain mapping."""
-    try:
-        (pairs,) = loader.construct_sequence(node, deep=True)  # type: ignore[arg-type]  # else ConstructorError
-        return dict(pairs)
-    except (TypeError, ValueError):
-        raise yaml.constructor.ConstructorError(None, None, "not an ordered mapping", node.start_mark) from None
-
-
-_Loader.add_constructor("tag:yaml.org,2002:python/object/apply:collections.OrderedDict", _ordered_mapping)
-
-
 def parse_yaml(text: str, origin: str) -> Any:
     """
     Read YAML made of plain values.
@@ -93,7 +62,7 @@ def parse_yaml(text: str, origin: str) -> Any:
     :raises ConfigError: if it is damaged or holds tags that build objects
     """
     try:
-        return yaml.load(text, Loader=_Loader)
+        return yaml.load(text, Loader=PlainLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f", line {mark.line + 1}" if mark else ""

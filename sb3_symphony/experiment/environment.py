@@ -202,6 +202,7 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*is out of date")  # papers' figures are for the older versions
+            warnings.filterwarnings("ignore", message=".*Using the latest versioned")  # an error, see below
             env = gym.make(env_id, **env_kwargs)
     except (gym.error.DependencyNotInstalled, ImportError) as error:
         message = str(error)

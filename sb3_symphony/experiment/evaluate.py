@@ -152,9 +152,12 @@ def _play_here(seed: int, deterministic: bool) -> Episode:
 def _in_processes(options: EvaluateOptions, seeds: range) -> Iterator[Episode]:
     context = multiprocessing.get_context("spawn")
     workers = min(options.n_envs, len(seeds))
+    before = set(multiprocessing.active_children())
     with ProcessPoolExecutor(workers, context, _start, (options,)) as pool:
         try:
             yield from pool.map(partial(_play_here, deterministic=options.deterministic), seeds)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(multiprocessing.active_children()) - before:
+                process.terminate()  # not after whole episodes
             raise

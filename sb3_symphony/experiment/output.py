@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -94,7 +95,7 @@ def report(name: str | None) -> Iterator[Callable[[Any], None]]:
     path = None if name in (None, "-") else output_file(name, "--json")
 
     def tell(values: Any) -> None:
-        text = json.dumps(values, indent=1, default=str)
+        text = json.dumps(_with_null(values), indent=1, default=str)
         if name == "-":
             print(text)
         elif path is not None:
@@ -105,6 +106,15 @@ def report(name: str | None) -> Iterator[Callable[[Any], None]]:
                 raise
 
     yield tell
+
+
+def _with_null(values: Any) -> Any:
+    """JSON has no numbers that are not finite."""
+    if isinstance(values, dict):
+        return {key: _with_null(value) for key, value in values.items()}
+    if isinstance(values, list | tuple):
+        return [_with_null(value) for value in values]
+    return None if isinstance(values, float) and not math.isfinite(values) else values
 
 
 def progress_bar(items: Iterable[_Item], what: str, shown: bool, total: float | None = None) -> Generator[_Item, None, None]:

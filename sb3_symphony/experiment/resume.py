@@ -10,6 +10,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import get_latest_run_id
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis.runs import noted_log, read_evaluations
@@ -70,7 +71,7 @@ class StoredRun:
             checkpoint = newest_checkpoint(self.run.checkpoints)
         except DamagedFile as error:
             raise ConfigError(f"--resume: no checkpoint of '{self.run.path}' is whole — {error}") from None
-        if checkpoint is None and self.steps > 0:  # it had learned something, which must not be overwritten
+        if checkpoint is None and self.steps >= self.options.save_freq:  # there was one, and much was learned since
             raise ConfigError(
                 f"--resume: '{self.run.path}' has a model of {self.steps} steps, but no checkpoint — start a new run"
             )
@@ -148,12 +149,18 @@ def open_run(options: TrainOptions) -> StoredRun:
 
 def restore_files(run: RunFolder, checkpoint: Checkpoint | None) -> None:
     """
-    Give the files that grow in the course of a run the content they had at a checkpoint; without one, remove them.
+    Give the files that grow in the course of a run the content they had at a checkpoint; without one, remove them, and keep
+    the model of a run that was stopped so soon as that of its steps.
 
     :param run: folder of the run
     :param checkpoint: where to go on from
     """
     contents = checkpoint.state["files"] if checkpoint else {}
+    if checkpoint is None and run.model.is_file():
+        steps = model_steps(run.model)
+        run.model.rename(run.path / f"rl_model_{steps}_steps.zip")
+        if run.normalization.is_file():
+            run.normalization.rename(run.path / f"rl_model_vecnormalize_{steps}_steps.pkl")
     for path in run.growing_files():
         if path.name not in contents:
             path.unlink()
@@ -169,6 +176,12 @@ class _TensorBoardOnward(TensorBoardOutputFormat):
         self._is_closed = False
 
 
+def _is_copy(run: RunFolder, checkpoint: Checkpoint) -> bool:
+    """Whether the folder that the checkpoint was made in is there too."""
+    made_in = checkpoint.state.get("folder")
+    return made_in is not None and Path(made_in).is_dir() and not Path(made_in).samefile(run.checkpoints)
+
+
 def continue_logs(model: BaseAlgorithm, run: RunFolder, checkpoint: Checkpoint, learn_arguments: dict[str, Any]) -> None:
     """
     Let a resumed model log as if it had never stopped.
@@ -181,6 +194,10 @@ def continue_logs(model: BaseAlgorithm, run: RunFolder, checkpoint: Checkpoint, 
     if model.tensorboard_log:
         noted = noted_log(run.log_folder)
         folder = str(noted.absolute()) if noted is not None and noted.is_dir() else checkpoint.state["log folder"]
+        if _is_copy(run, checkpoint):  # the log is that of the run it was copied from, which may go on too
+            name = Path(folder).name.rpartition("_")[0]
+            latest = get_latest_run_id(model.tensorboard_log, name)
+            folder = str(Path(model.tensorboard_log) / f"{name}_{latest + 1}")
         writers: list[KVWriter] = [HumanOutputFormat(sys.stdout)] if model.verbose >= 1 else []
         model.set_logger(Logger(folder, [*writers, _TensorBoardOnward(folder, checkpoint.steps)]))
     if isinstance(model, OnPolicyAlgorithm) and learn_arguments.get("log_interval", 1) is not None:

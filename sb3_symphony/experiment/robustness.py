@@ -70,6 +70,7 @@ class ActionDelay(gym.Wrapper):
         super().__init__(env)
         self.steps = steps
         self.waiting: deque[np.ndarray] = deque()
+        self.rest = np.zeros(0)  # what acts before
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
@@ -80,7 +81,7 @@ class ActionDelay(gym.Wrapper):
         space = self.action_space
         assert isinstance(space, spaces.Box)
         rest = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
-        self.waiting = deque([rest] * self.steps)
+        self.rest, self.waiting = rest, deque()
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -89,4 +90,4 @@ class ActionDelay(gym.Wrapper):
         :return: observation, reward, terminated, truncated, info
         """
         self.waiting.append(action)
-        return self.env.step(self.waiting.popleft())
+        return self.env.step(self.waiting.popleft() if len(self.waiting) > self.steps else self.rest)

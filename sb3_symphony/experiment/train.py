@@ -4,7 +4,7 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -247,6 +247,18 @@ def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     save_model(model, run.model, run.normalization)
 
 
+@contextmanager
+def _nothing_lost(model: BaseAlgorithm, run: RunFolder) -> Iterator[None]:
+    """Whatever an environment or a callback stumbles over: what was learned so far is kept."""
+    try:
+        yield
+    except Exception:
+        if model.num_timesteps > 0:
+            _save_model(model, run)
+            print(f"note: saved {run.model}, of {model.num_timesteps} steps", file=sys.stderr)
+        raise
+
+
 def effective_config(options: TrainOptions) -> RunConfig:
     """
     :param options: options of the command line
@@ -413,7 +425,8 @@ def _train(
     written = [run.path, *([Path(options.tensorboard_log)] if options.tensorboard_log else [])]
     with stop.listening(), full_disk_told(written, onward):
         try:
-            model.learn(total, callback=callbacks, **learn_arguments)
+            with _nothing_lost(model, run) if checkpoints is None else nullcontext():
+                model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:
             stop.requested = True
         seconds = (time.time_ns() - (model.start_time or time.time_ns())) / 1e9

@@ -77,7 +77,11 @@ def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: b
     set_random_seed(model.seed)  # loading has left the trained one's
     if normalization is not None and selection.normalization is not None:
         stored = load_normalization(selection.normalization, normalization.venv)
-        normalization.obs_rms, normalization.ret_rms = stored.obs_rms, stored.ret_rms
+        if normalization.norm_obs and not stored.norm_obs:
+            raise ConfigError(f"-i: {selection.model}: was trained without norm_obs — expected normalize: {{norm_obs: false}}")
+        for name in ("obs_rms", "ret_rms"):
+            if name in vars(stored):
+                setattr(normalization, name, getattr(stored, name))
     if with_replay_buffer:
         _take_experience(model, selection)
 
