@@ -150,8 +150,8 @@ def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold:
     for first in range(len(steps) - consecutive + 1):
         if good[first : first + consecutive].all():
             return Event(True, int(steps[first]))
-    open_from = np.flatnonzero(~good)[-1] + 1 if not good.all() else 0  # good ones from here on: more might have followed
-    return Event(False, int(steps[open_from - 1]) if open_from else 0)
+    bad = np.flatnonzero(~good)  # after the last of them, more good ones might have followed
+    return Event(False, int(steps[bad[-1]]) if len(bad) else 0)
 
 
 def first_episode(steps: ArrayLike, returns: ArrayLike, threshold: float = 300.0, window: int = 1) -> Event:

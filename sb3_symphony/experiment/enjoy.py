@@ -2,7 +2,6 @@
 
 import os
 import sys
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,14 +50,14 @@ def enjoy(options: EnjoyOptions) -> list[EnjoyedEpisode]:
     with open_agent(options, options.n_envs, mode, norm_reward=options.norm_reward) as agent:
         if options.norm_reward and unwrap_vec_normalize(agent.env) is None:
             raise ConfigError(f"--norm-reward: {agent.selection.model} has no VecNormalize statistics")
-        told: AbstractContextManager = nullcontext()
+        written: list[Path] = []
         if options.reward_log is not None:
-            attach_monitor_files(agent.env, _log_folder(options.reward_log, options.n_envs))
-            told = full_disk_told([Path(options.reward_log)])
+            written.append(_log_folder(options.reward_log, options.n_envs))
+            attach_monitor_files(agent.env, written[0])
         print(f"{agent.selection.algo} on {agent.selection.env_id}: {agent.selection.model}", flush=True)
         episodes: list[EnjoyedEpisode] = []
         try:
-            with told:
+            with full_disk_told(written):
                 _act(agent, options, episodes)
         except KeyboardInterrupt:
             pass  # how one stops watching

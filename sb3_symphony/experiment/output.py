@@ -156,14 +156,14 @@ def full_disk_told(paths: Sequence[Path], onward: str = "") -> Iterator[None]:
     """
     A full disk ends the block with one line.
 
-    :param paths: what is written inside, for messages
+    :param paths: what is written inside, for messages; nothing: errors are left alone
     :param onward: what to do once there is room, in words
     :raises ConfigError: if the disk is full
     """
     try:
         yield
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if not paths or error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
         hint = f" — once there is room, {onward}" if onward else ""
         places = " or ".join(f"'{path}'" for path in paths)

@@ -69,8 +69,9 @@ class ActionDelay(gym.Wrapper):
             raise TypeError(f"expected continuous actions (Box), got {env.action_space}")
         super().__init__(env)
         self.steps = steps
+        space = env.action_space
+        self.rest = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
         self.waiting: deque[np.ndarray] = deque()
-        self.rest = np.zeros(0)  # what acts before
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
@@ -78,10 +79,7 @@ class ActionDelay(gym.Wrapper):
         :param options: handed to the environment
         :return: first observation and info
         """
-        space = self.action_space
-        assert isinstance(space, spaces.Box)
-        rest = np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
-        self.rest, self.waiting = rest, deque()
+        self.waiting.clear()
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
