@@ -245,7 +245,7 @@ def _add_selection(parser: argparse.ArgumentParser, several: bool = False) -> No
     add("--load-last-checkpoint", action="store_true", help="model saved latest, of a run that did not end")
     add("--vecnormalize", metavar="PKL", help="statistics of VecNormalize, or none (default: the run's)")
     add("--env-kwargs", **_SEVERAL, metavar="K:V", help="arguments of the environment")
-    add("--env-wrapper", **_SEVERAL, metavar="W:{K: V}", help="wrappers of the environment, or other arguments for the run's")
+    add("--env-wrapper", **_SEVERAL, metavar="W[:{K: V}]", help="wrappers of the environment, or arguments of the run's")
     add("--gym-packages", **_SEVERAL, metavar="M", help="modules to import, which register environments")
     add("--device", help="auto, cpu or cuda (default: auto)")
     add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch")
@@ -260,6 +260,8 @@ def _add_deterministic(parser: argparse.ArgumentParser) -> None:
 
 def _selection(model: type[SelectOptions], arguments: dict[str, Any]) -> Any:
     """The options of a command on a trained agent."""
+    if "env_wrapper" in arguments:  # a wrapper's arguments may be left out
+        arguments["env_wrapper"] = [name if ":" in name else f"{name}:{{}}" for name in arguments["env_wrapper"]]
     for name, flag in (("env_kwargs", "--env-kwargs"), ("env_wrapper", "--env-wrapper")):
         if name in arguments:
             arguments[name] = parse_pairs(arguments[name], flag)

@@ -193,12 +193,13 @@ def test_command(model, capsys):
     assert json.loads(capsys.readouterr().out)[0]["reward"] == one["reward"]
 
 
-def test_an_agent_that_acts_every_second_step(model, monkeypatch):
+@pytest.mark.parametrize(("arguments", "skipped"), [(":{skip: 2}", 2), ("", 4)])  # 4: the wrapper's default
+def test_an_agent_that_acts_every_few_steps(model, monkeypatch, arguments, skipped):
     recorded = []
     monkeypatch.setattr("sb3_symphony.experiment.gait.plot_gait", lambda recordings, *args: recorded.extend(recordings))
-    skip = "stable_baselines3.common.atari_wrappers.MaxAndSkipEnv:{skip: 2}"
+    skip = f"stable_baselines3.common.atari_wrappers.MaxAndSkipEnv{arguments}"
     assert main(["gait", "agent", "--env-wrapper", skip, *WALK]) == 0
-    assert recorded[0].steps_per_second == 25.0 and recorded[0].times[0] == pytest.approx(0.04)
+    assert recorded[0].steps_per_second == 50 / skipped and recorded[0].times[0] == pytest.approx(0.02 * skipped)
 
 
 def test_no_pictures(model):
