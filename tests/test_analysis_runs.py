@@ -2,9 +2,11 @@
 
 from collections import OrderedDict
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from stable_baselines3.common.monitor import Monitor
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis.runs import (
@@ -47,6 +49,24 @@ def test_parallel_environments_step_together(tmp_path):
     np.testing.assert_array_equal(episodes.lengths, [10, 15, 20])
     np.testing.assert_array_equal(episodes.seconds, [1.0, 2.5, 5.0])
     assert episodes.successes is None
+
+
+def test_a_folder_of_sb3s_monitor(tmp_path):
+    """With names as SB3 gives them; the file knows the environment."""
+    (tmp_path / "mine").mkdir()
+    env = Monitor(gym.make("Pendulum-v1", max_episode_steps=5), str(tmp_path / "mine"))
+    for _ in range(2):
+        env.reset(seed=0)
+        while not env.step([0.0])[3]:
+            pass
+    env.close()
+    run = open_run(tmp_path / "mine")
+    assert (run.algo, run.env) == ("mine", "Pendulum-v1")
+    np.testing.assert_array_equal(run.episodes.steps, [5, 10])
+    np.testing.assert_array_equal(run.episodes.returns, np.round(env.get_episode_rewards(), 6))
+    (tmp_path / "mine" / "monitor.csv").write_text("r,l,t\n")
+    with pytest.raises(ValueError, match="not a monitor file"):
+        open_run(tmp_path / "mine")
 
 
 def test_a_torn_last_line_is_left_out(tmp_path):

@@ -141,7 +141,7 @@ def summarised(label: str, seeds: Sequence[Line]) -> Curve:
 
 def _episodes_of(run: Run, need: str) -> Line:
     if run.episodes is None:
-        raise NotRecorded(f"{run.path}: has no *.monitor.csv — expected one for {need}")
+        raise NotRecorded(f"{run.path}: has no *monitor.csv — expected one for {need}")
     return run.episodes.steps, run.episodes.seconds
 
 

@@ -7,6 +7,7 @@ import os
 import re
 import zipfile
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -79,27 +80,24 @@ class Scalar:
 
 def read_episodes(folder: Path) -> Episodes | None:
     """
-    Read the ``*.monitor.csv`` of a run. Lines cut short by a crash are left out.
+    Read the ``*monitor.csv`` of a run. Lines cut short by a crash are left out.
 
-    :param folder: run folder
+    :param folder: run folder, or one that holds the files of SB3's ``Monitor``
     :return: its training episodes, None if there are no such files
     :raises ValueError: if a file is something else
     """
-    paths = sorted(folder.glob("*.monitor.csv"))
+    paths = _monitor_files(folder)
     if not paths:
         return None
     starts: list[float] = []
     rows: list[tuple[int, float, float, int, float]] = []  # step and time of the end, return, length, success
     for path in paths:
-        try:
-            with path.open(encoding="utf-8", newline="") as lines:
-                starts.append(float(json.loads(lines.readline().removeprefix("#"))["t_start"]))
-                step = 0
-                for row in _monitor_rows(csv.DictReader(lines), starts[-1]):
-                    step += row[2] * len(paths)  # all copies of the environment step together
-                    rows.append((step, *row))
-        except (ValueError, KeyError, TypeError, OSError) as error:
-            raise Damaged(f"{path}: not a monitor file of Stable-Baselines3, or damaged — {error}") from None
+        with _monitor_file(path) as (header, lines):
+            starts.append(float(header["t_start"]))
+            step = 0
+            for row in _monitor_rows(csv.DictReader(lines), starts[-1]):
+                step += row[2] * len(paths)  # all copies of the environment step together
+                rows.append((step, *row))
     rows.sort(key=lambda row: row[:2])
     steps, ends, returns, lengths, successes = np.array(rows, dtype=float).reshape(-1, 5).T
     return Episodes(
@@ -109,6 +107,20 @@ def read_episodes(folder: Path) -> Episodes | None:
         lengths=lengths.astype(np.int64),
         successes=None if np.isnan(successes).any() or not rows else successes,
     )
+
+
+def _monitor_files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*monitor.csv"))  # with names as SB3 finds them: Monitor(env, folder) leaves monitor.csv
+
+
+@contextmanager
+def _monitor_file(path: Path) -> Iterator[tuple[dict[str, Any], Iterator[str]]]:
+    """The header of the file, and the lines below."""
+    try:
+        with path.open(encoding="utf-8", newline="") as lines:
+            yield json.loads(lines.readline().removeprefix("#")), lines
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise Damaged(f"{path}: not a monitor file of Stable-Baselines3, or damaged — {error}") from None
 
 
 def _monitor_rows(rows: csv.DictReader, start: float) -> Iterator[tuple[float, float, int, float]]:
@@ -251,17 +263,21 @@ def noted_log(note: Path) -> Path | None:
 
 def open_run(folder: Path) -> Run:
     """
-    :param folder: run folder, or folder of TensorBoard event files
+    :param folder: run folder, folder of TensorBoard event files, or one that holds the files of SB3's ``Monitor``
     :return: the run
-    :raises ValueError: if it is neither
+    :raises ValueError: if it is none of these
     """
     name, _, number = folder.absolute().name.rpartition("_")
     if any(folder.glob("events.out.tfevents.*")):  # SB3: <log>/<name>_<number>
         return Run(folder, (name or number).lower(), folder.absolute().parent.name, None, {}, folder)
-    if not any(folder.glob("*.monitor.csv")) and not any(folder.glob("*/config.yml")):
+    monitors, details = _monitor_files(folder), next((path.parent for path in sorted(folder.glob("*/config.yml"))), None)
+    if not monitors and details is None:
         what = "no run folder and no TensorBoard log" if folder.is_dir() else "no such folder"
         raise ValueError(f"{folder}: {what} — expected one such as logs/symphony/BipedalWalker-v3_1")
-    details = next((path.parent for path in sorted(folder.glob("*/config.yml"))), folder / name)
+    if details is None and not (name and number.isdecimal()):  # Monitor(env, folder): only the file names the environment
+        with _monitor_file(monitors[0]) as (header, _):
+            return Run(folder, folder.absolute().name, str(header["env_id"]), None, {}, None)
+    details = details or folder / name
     options, config = (_plain_mapping(details / file) for file in ("args.yml", "config.yml"))
     return Run(
         folder,
@@ -289,7 +305,7 @@ def find_runs(folder: Path, algos: Iterable[str], envs: Iterable[str]) -> list[R
         name, _, number = path.name.rpartition("_")
         algo = path.parent.name
         if number.isdecimal() and (not algos or algo in algos) and (not envs or name in envs):
-            if any(path.glob("*.monitor.csv")) or any(path.glob("*/config.yml")):
+            if _monitor_files(path) or any(path.glob("*/config.yml")):
                 found.append(((algos.index(algo) if algos else 0, algo, name, int(number)), path))
     return [replace(open_run(path), algo=path.parent.name) for _, path in sorted(found)]
 
