@@ -40,8 +40,8 @@ def config(algo="sac", env="Pendulum-v1", **hyperparams) -> RunConfig:
     return load_config(validated(TrainOptions, {"algo": algo, "env": env, "hyperparams": hyperparams}))
 
 
-def decode(algo="sac", env="Pendulum-v1", **hyperparams):
-    return algorithm_arguments(algo, load_algorithm(algo), config(algo, env, **hyperparams), ACTIONS)
+def decode(algo="sac", env="Pendulum-v1", actions=ACTIONS, **hyperparams):
+    return algorithm_arguments(algo, load_algorithm(algo), config(algo, env, **hyperparams), actions)
 
 
 @pytest.mark.parametrize("text, value", [("1e-3", 1e-3), ("1e6", 1e6), ("-2.5E+2", -250.0), ("3e4", 3e4), ("7_0e1", 700.0)])
@@ -344,7 +344,8 @@ def test_every_shipped_entry_fits_its_class(algo):
 @pytest.mark.parametrize("algo", ["symphony", "redq", "droq"])
 def test_every_shipped_entry_takes_the_fused_way(algo):
     for env in shipped_environments(algo):
-        model = load_algorithm(algo)(env=env, device="cpu", **decode(algo, env))
+        made = gym.make(env)
+        model = load_algorithm(algo)(env=made, device="cpu", **decode(algo, env, made.action_space))
         assert type(model._regression) is FusedRegression, env
 
 
