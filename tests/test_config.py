@@ -260,7 +260,7 @@ def test_noise_type_for_an_algorithm_without_noise():
 
 def test_two_noises():
     with pytest.raises(
-        ConfigError, match="action_noise: beside it the configuration has noise_type 'normal' — expected noise"
+        ConfigError, match="action_noise: beside it the configuration has noise_type 'normal' — expected action_noise: null"
     ):
         decode("td3", noise_type="normal", noise_std=0.1, action_noise={"PinkActionNoise": {"sigma": 0.3}})
 

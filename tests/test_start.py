@@ -372,7 +372,7 @@ def test_images_with_evaluations(kinds):
     assert main(["evaluate", *found]) == 0
 
 
-@pytest.mark.parametrize("noise", ["noise_type:normal noise_std:0.1", "action_noise:PinkActionNoise"])
+@pytest.mark.parametrize("noise", ["noise_type:normal noise_std:0.1 action_noise:null", "action_noise:PinkActionNoise"])
 @pytest.mark.parametrize("actions", ["[2,2]", "[2]", "[]"])
 def test_actions_of_any_shape_with_noise(kinds, noise, actions):
     argv = [*kinds, *noise.split(), "--env-kwargs", f"actions:{actions}", "--eval-freq", "0"]

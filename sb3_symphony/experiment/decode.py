@@ -380,10 +380,10 @@ def algorithm_arguments(
     if settings.noise_type is not None:
         if "action_noise" not in known:
             raise ConfigError(f"noise_type: {settings.noise_type!r} — {name} takes no action noise")
-        if "action_noise" in plain_arguments:
+        if plain_arguments.get("action_noise") is not None:
             raise ConfigError(
                 f"action_noise: beside it the configuration has noise_type {settings.noise_type!r} — "
-                "expected noise_type: null and noise_std: null then"
+                "expected action_noise: null, or noise_type: null and noise_std: null"
             )
         noise = {"normal": "NormalActionNoise", "ornstein-uhlenbeck": "OrnsteinUhlenbeckActionNoise"}[settings.noise_type]
         plain_arguments["action_noise"] = {noise: {"sigma": settings.noise_std}}
