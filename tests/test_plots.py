@@ -257,7 +257,7 @@ def test_plot_training(tmp_path, figures):
 
 
 def test_a_run_without_episodes_has_a_figure_too(tmp_path, figures):
-    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 5.0, "env_id": "X-v0"}\nr,l,t\n')
+    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 5.0}\nr,l,t\n')
     assert plot_training(tmp_path).exists()
     assert texts(figures[0].axes[0]) == ["no finished episode"]
 

@@ -276,7 +276,8 @@ def open_run(folder: Path) -> Run:
         raise ValueError(f"{folder}: {what} — expected one such as logs/symphony/BipedalWalker-v3_1")
     if details is None and not (name and number.isdecimal()):  # Monitor(env, folder): only the file names the environment
         with _monitor_file(monitors[0]) as (header, _):
-            return Run(folder, folder.absolute().name, str(header["env_id"]), None, {}, None)
+            own = folder.absolute().name
+            return Run(folder, own, str(header["env_id"]) if "env_id" in header else own, None, {}, None)
     details = details or folder / name
     options, config = (_plain_mapping(details / file) for file in ("args.yml", "config.yml"))
     return Run(
