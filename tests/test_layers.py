@@ -10,7 +10,7 @@ from torch import nn
 
 from sb3_symphony.common.ensembles import hidden_layers, mlp
 from sb3_symphony.common.kernels import LEAKY_RELU, layer_forward
-from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropout_mask
+from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropped
 from sb3_symphony.redq.policies import REDQPolicy
 from sb3_symphony.symphony.policies import SymphonyPolicy
 
@@ -80,12 +80,11 @@ def test_layer_norm_of_the_reference():
 
 @pytest.mark.parametrize("rate", [0.001, 0.01, 0.1, 0.11, 0.5])
 @pytest.mark.parametrize("shape", [(2, 64, 128), (7,), (1,)])
-def test_dropout_masks_drop_each_element_with_the_same_probability_independently(rate, shape):
+def test_dropout_drops_each_element_with_the_same_probability_independently(rate, shape):
     th.manual_seed(0)
     n_masks = 100 if len(shape) > 1 else 200_000 // shape[0]
-    masks = th.full((n_masks, *shape), math.nan)
-    for mask in masks:
-        draw_dropout_mask(mask, rate, 1 / (1 - rate))
+    layer, ones = Dropout(rate), th.ones(shape)
+    masks = th.stack([layer(ones) for _ in range(n_masks)])
     assert masks.unique().tolist() == pytest.approx([0, 1 / (1 - rate)])
     dropped = (masks == 0).double().flatten(1)  # (n_masks, elements)
 
@@ -102,11 +101,12 @@ def test_dropout_masks_drop_each_element_with_the_same_probability_independently
                 assert both == pytest.approx(rate**2, abs=error(rate**2, first.numel()))
 
 
-def test_a_mask_goes_on_where_the_gaps_drawn_at_once_end(monkeypatch):
+def test_draws_go_on_where_the_gaps_drawn_at_once_end(monkeypatch):
     monkeypatch.setattr(th.Tensor, "geometric_", lambda self, rate: self.fill_(3))
-    mask = th.empty(100)
-    draw_dropout_mask(mask, 0.01)
-    assert (mask == 0).nonzero().flatten().tolist() == list(range(2, 100, 3))
+    assert draw_dropped(100, 0.01).tolist() == list(range(2, 100, 3))
+    monkeypatch.setattr(th.Tensor, "geometric_", lambda self, rate: self.fill_(len(self)))
+    assert draw_dropped(9, 0.01).tolist() == [7]  # 8 gaps at once
+    assert draw_dropped(7, 0.01).tolist() == []
 
 
 def test_dropout_of_everything_and_of_nothing():
@@ -271,5 +271,6 @@ def test_kernels_compile_where_nothing_can_be_cached(monkeypatch):
         njit(cache=True)(lambda x: x)
     forward = layer_forward.__wrapped__(layer_norm=False, dropout=False, activation=LEAKY_RELU)
     product, bias, unused = np.array([[[1.0, -2.0]]]), np.array([[[0.5, 0.5]]]), np.zeros((1, 1, 2))
-    forward(product, bias, unused, unused, unused, 0.0, 0.1, unused[0], unused, unused, np.array([0]), 1.0)
+    members, dropped = np.array([0]), np.array([], dtype=np.int64)
+    forward(product, bias, unused, unused, 0.0, 0.1, unused[0], unused, unused, members, 1.0, dropped)
     np.testing.assert_allclose(product, [[[1.5, -0.15]]])

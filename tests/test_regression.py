@@ -234,7 +234,7 @@ def test_critics_and_targets_take_turns_in_one_memory():
     (own,), (targets,) = fitter._networks.values()
     for one, other in zip(own.hidden, targets.hidden, strict=True):
         assert one.weight is not other.weight
-        for name in ("out", "grad", "product", "mask", "rstd", "derivative"):
+        for name in ("out", "grad", "product", "rstd", "derivative"):
             assert getattr(one, name) is getattr(other, name)
     fitter.fit(*batch_of(12), TAU)  # another batch size, another memory
     assert fitter._networks[fitter.critic][0].hidden[0].out is not own.hidden[0].out
@@ -409,6 +409,30 @@ def test_another_optimizer_is_used(optimizer, kwargs):
         run(fitter, 20, first=5)
     for a, b in zip(fitters[0].critic.parameters(), fitters[1].critic.parameters(), strict=True):
         th.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_options_of_the_group_count_not_those_given_at_first():
+    fitters = pair()
+    for fitter in fitters:
+        run(fitter, 5)
+        fitter.critic.optimizer.param_groups[0]["maximize"] = True
+        run(fitter, 5, first=5)
+    assert_equal_states(*fitters)
+
+
+@pytest.mark.parametrize("turned", ["critic", "critic_target"])
+def test_weights_that_are_not_contiguous_are_learned(turned):
+    """Those of separate networks, which are (out, in), come stacked like that."""
+    fitters = pair()
+    for fitter in fitters:
+        for layer in getattr(fitter, turned).q_networks.layers:
+            if isinstance(layer, StackedLinear):
+                layer.weight.data = layer.weight.data.transpose(1, 2).contiguous().transpose(1, 2)
+        learned = [*fitter.critic.parameters(), *fitter.critic_target.parameters()]
+        before = [parameter.detach().clone() for parameter in learned]
+        run(fitter, 10)
+        assert not any(map(th.equal, learned, before))
+    assert_equal_states(*fitters)
 
 
 @pytest.mark.parametrize("n_groups", [1, 2])

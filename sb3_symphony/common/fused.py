@@ -25,7 +25,7 @@ from sb3_symphony.common.kernels import (
     output_backward,
     output_forward,
 )
-from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropout_mask
+from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropped
 
 aten = th.ops.aten
 
@@ -96,6 +96,9 @@ def all_members(n: int) -> np.ndarray:
     return np.arange(n)
 
 
+NOTHING = np.zeros(0, dtype=np.int64)
+
+
 class Products:
     """
     The products of a hidden layer: with its weights, and the two of its backward pass.
@@ -105,6 +108,7 @@ class Products:
 
     def __init__(self, weight: th.Tensor) -> None:
         self.weight = weight
+        self._all_members = all_members(weight.shape[0])
 
     def forward(self, x: th.Tensor, members: np.ndarray, out: th.Tensor) -> None:
         """
@@ -112,7 +116,7 @@ class Products:
         :param members: Indices ``(n,)`` of the networks to compute
         :param out: Where to write the result ``(n, batch, width)``
         """
-        if members is all_members(len(self.weight)):
+        if members is self._all_members:
             th.bmm(x, self.weight, out=out)
         else:  # one by one, rather than gather the weights first
             for k, each, result in zip(members.tolist(), x, out, strict=True):
@@ -157,7 +161,7 @@ class BFloat16Products(Products):
         n = len(members)
         rounded_x, weight, product = self.operands[0][:n], self.operands[1][:n], self.results[2][:n]
         rounded_x.copy_(x)
-        if members is all_members(len(self.weight)):
+        if members is self._all_members:
             weight.copy_(self.weight)
         else:
             for k, each in zip(members.tolist(), weight, strict=True):
@@ -191,6 +195,7 @@ class Layer:
 
     def __init__(self, linear: StackedLinear) -> None:
         self.weight = linear.weight.detach()
+        self._n_members = self.weight.shape[0]
         self.parameters: list[nn.Parameter] = [linear.weight, linear.bias]
         self.grads = [th.zeros_like(parameter).detach() for parameter in self.parameters]
 
@@ -199,7 +204,7 @@ class Hidden(Layer):
     """
     ``Linear → Dropout → LayerNorm → activation``; dropout and LayerNorm may be missing.
 
-    The dropout masks are those of the module with the same generator state.
+    What is dropped is what the module drops with the same generator state.
 
     :param lender: A layer of the same shape, of another network, whose memory is used; what that has computed is lost then.
         Critics and targets take turns, and what both keep for themselves does not fit a second-level cache
@@ -225,48 +230,45 @@ class Hidden(Layer):
             # LayerNorm and sine need what they were computed from in their backward pass; the others work in place
             keeps_product = norm is not None or activation.code == LEAKY_SINE
             self.product = th.zeros_like(self.out) if keeps_product else self.out
-            self.mask = th.zeros(self.out.shape if dropout is not None else (1, 1, 1), dtype=th.uint8)
             self.rstd = self.out.new_zeros(self.out.shape[:2])
             self.derivative = th.zeros_like(self.out) if activation.code == LEAKY_SINE else self.out
         else:
             self.out, self.grad, self.product = lender.out, lender.grad, lender.product
-            self.mask, self.rstd, self.derivative = lender.mask, lender.rstd, lender.derivative
+            self.rstd, self.derivative = lender.rstd, lender.derivative
         gain = shift = linear.bias  # in place of what the kernel does not use
         if norm is not None:
             gain, shift = norm.weight, norm.bias
             self.parameters += [gain, shift]
             self.grads += [th.zeros_like(gain).detach(), th.zeros_like(shift).detach()]
 
-        product, mask, out, grad, rstd, derivative = map(
-            array, (self.product, self.mask, self.out, self.grad, self.rstd, self.derivative)
-        )
+        product, out, grad, rstd, derivative = map(array, (self.product, self.out, self.grad, self.rstd, self.derivative))
         bias, gains, shifts = map(array, (linear.bias, gain, shift))
         self._real = out.dtype.type
         eps, slope = self._real(0 if norm is None else norm.eps), self._real(activation.slope)
         options = norm is not None, dropout is not None, activation.code
-        self._forward = partial(layer_forward(*options), product, bias, mask, gains, shifts, eps, slope, rstd, derivative, out)
+        self._forward = partial(layer_forward(*options), product, bias, gains, shifts, eps, slope, rstd, derivative, out)
         grads = map(array, (self.grads[1], self.grads[-2], self.grads[-1]))
-        self._backward = partial(layer_backward(*options), grad, product, out, mask, gains, slope, rstd, derivative, *grads)
-        self._kept = self._real(1)  # factor of what dropout keeps
+        self._backward = partial(layer_backward(*options), grad, product, out, gains, slope, rstd, derivative, *grads)
+        self._dropout = self._real(1), NOTHING  # factor of what dropout keeps, positions of what it drops
 
     def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
         """
-        :param x: ``(batch, in_features)`` or ``(n, batch, in_features)``
+        :param x: ``(n, batch, in_features)``
         :param members: Indices ``(n,)`` of the networks to compute
         :return: ``(n, batch, width)``
         """
         n = len(members)
-        self.input = x.expand(n, -1, -1)
-        self.products.forward(self.input, members, self.product[:n])
+        product, out = self.product, self.out
+        if n < self._n_members:
+            product, out = product[:n], out[:n]
+        self.input = x
+        self.products.forward(x, members, product)
         if self.dropout is not None:
-            drops = self.dropout.training and self.dropout.p > 0
-            if drops:
-                draw_dropout_mask(self.mask[:n], self.dropout.p)
+            if self.dropout.training and self.dropout.p > 0:
+                self._dropout = self._real(self.dropout.scale), draw_dropped(out.numel(), self.dropout.p)
             else:
-                self.mask.fill_(1)
-            self._kept = self._real(self.dropout.scale if drops else 1)
-        self._forward(members, self._kept)
-        out = self.out[:n]
+                self._dropout = self._real(1), NOTHING
+        self._forward(members, *self._dropout)
         return out if self.activation.forward is None else self.activation.forward(out)
 
     def backward(self) -> th.Tensor:
@@ -276,7 +278,7 @@ class Hidden(Layer):
         """
         if self.activation.backward is not None:
             self.activation.backward(self.grad, self.out)
-        self._backward(self._kept)
+        self._backward(*self._dropout)
         return self.grad
 
 
@@ -292,15 +294,13 @@ class Output(Layer):
         super().__init__(linear)
         self.out = _zeros(linear, batch_size)
         weight, bias, grad_weight, grad_bias = map(array, (*self.parameters, *self.grads))
-        n_members = len(weight)
-        self.weights = weight.reshape(n_members, -1), bias.reshape(n_members)
-        self.weight_grads = grad_weight.reshape(n_members, -1), grad_bias.reshape(n_members)
+        self.weights = weight.reshape(self._n_members, -1), bias.reshape(self._n_members)
+        self.weight_grads = grad_weight.reshape(self._n_members, -1), grad_bias.reshape(self._n_members)
 
     def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
         """Parameters and return value as in :meth:`Hidden.forward`."""
-        n = len(members)
-        self.input = array(x.expand(n, -1, -1).contiguous())
-        out = self.out[:n]
+        self.input = array(x.contiguous())
+        out = self.out[: len(members)]
         output_forward(self.input, *self.weights, members, array(out)[..., 0])
         return out
 
@@ -322,9 +322,8 @@ class WideOutput(Layer):
         self.products = Products(self.weight)
 
     def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
-        n = len(members)
-        self.input = x.expand(n, -1, -1)
-        out = self.out[:n]
+        self.input = x
+        out = self.out[: len(members)]
         self.products.forward(self.input, members, out)
         return out.add_(self.bias[members])
 
@@ -374,12 +373,15 @@ class FusedNetwork:
         layers: list[Layer] = [*self.hidden, self.output]
         self.parameters = [parameter for layer in layers for parameter in layer.parameters]
         self.grads = [grad for layer in layers for grad in layer.grads]
-        self._addresses = [parameter.data_ptr() for parameter in self.parameters]
+        self._addresses = [parameter.data_ptr() for parameter in parameters_of(network)]
 
-    def fits(self, batch_size: int) -> bool:
-        """Whether the workspaces have this batch size, and the parameters are still where they were."""
-        here = [parameter.data_ptr() for parameter in self.parameters]
-        return len(self.input) == batch_size and here == self._addresses
+    def fits(self, network: StackedMLP, batch_size: int) -> bool:
+        """Whether the workspaces have this batch size, the layers are those of the network, the parameters where they were."""
+        return (
+            self.input.shape[0] == batch_size
+            and are_same(self._layers, list(network.layers))
+            and [parameter.data_ptr() for parameter in parameters_of(network)] == self._addresses
+        )
 
     def resembles(self, network: StackedMLP) -> bool:
         """Whether a network's layers are of the same kinds and shapes, in the precision of these workspaces."""
@@ -397,8 +399,8 @@ class FusedNetwork:
         :param members: Compute these networks only
         :return: ``(n_members, batch, n_outputs)``, valid until the next call
         """
-        chosen = all_members(len(self.grad_input)) if members is None else np.array(members)
-        x = th.cat((features, actions), dim=1, out=self.input)
+        chosen = all_members(self.grad_input.shape[0]) if members is None else np.array(members)
+        x = th.cat((features, actions), dim=1, out=self.input).expand(len(chosen), -1, -1)
         for layer in self.hidden:
             x = layer.forward(x, chosen)
         return self.output.forward(x, chosen)

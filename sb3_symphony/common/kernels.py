@@ -55,6 +55,15 @@ def _sin_cos(x, real):
     return sign * sine * r, sign * cosine
 
 
+@_compiled
+def _mark(factors, value, start, dropped, k):
+    """Set the factors of what is dropped of a row that begins at position ``start``, from ``dropped[k]`` on; returns ``k``."""
+    while k < dropped.size and dropped[k] < start + factors.size:
+        factors[dropped[k] - start] = value
+        k += 1
+    return k
+
+
 @cache
 def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
     """
@@ -64,8 +73,8 @@ def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
     They are the same memory, and only ``product`` is used, if there is neither LayerNorm nor a sine.
 
     :param layer_norm: Whether there is LayerNorm, with ``gain`` and ``shift``; it leaves its factors in ``rstd (n, batch)``
-    :param dropout: Whether there is dropout, with ``mask`` of bytes: 0 for what is dropped, 1 for what is kept and multiplied
-        with ``kept``
+    :param dropout: Whether there is dropout, with the positions that are ``dropped``, rising, among the ``n`` results one
+        after another; the others are multiplied with ``kept``
     :param activation: One of the constants above; ``slope`` is that of negative values, 0 for a plain ReLU. That of the
         sine is left in ``derivative``
     :return: A kernel; it does not touch the arrays of what is switched off
@@ -73,20 +82,23 @@ def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
     in_place = not layer_norm and activation != LEAKY_SINE
 
     @_compiled
-    def forward(product, bias, mask, gain, shift, eps, slope, rstd, derivative, out, members, kept):
+    def forward(product, bias, gain, shift, eps, slope, rstd, derivative, out, members, kept, dropped):
         real = product.dtype.type
         batch, width = product.shape[1:]
         zero, scale = real(0), real(1 / width)
+        factors, row_start, beyond = np.full(width, kept), 0, 0
         for s in range(len(members)):
             b, g, c = bias[members[s], 0], gain[members[s], 0], shift[members[s], 0]
             for i in range(batch):
                 x = product[s, i]
                 y = x if in_place else out[s, i]
-                stays = mask[s, i] if dropout else b
                 mean, variance = zero, zero
+                first, beyond = beyond, _mark(factors, zero, row_start, dropped, beyond)
                 for j in range(width):
-                    x[j] = (x[j] + b[j]) * (real(stays[j]) * kept) if dropout else x[j] + b[j]
+                    x[j] = (x[j] + b[j]) * factors[j] if dropout else x[j] + b[j]
                     mean += x[j]
+                _mark(factors, kept, row_start, dropped, first)
+                row_start += width
                 if layer_norm:
                     mean *= scale
                     for j in range(width):
@@ -123,10 +135,11 @@ def layer_backward(layer_norm: bool, dropout: bool, activation: int) -> Callable
     in_place = not layer_norm and activation != LEAKY_SINE
 
     @_compiled
-    def backward(grad, normal, out, mask, gain, slope, rstd, derivative, grad_bias, grad_gain, grad_shift, kept):
+    def backward(grad, normal, out, gain, slope, rstd, derivative, grad_bias, grad_gain, grad_shift, kept, dropped):
         real = grad.dtype.type
         n, batch, width = grad.shape
         zero, scale = real(0), real(1 / width)
+        factors, row_start, beyond = np.full(width, kept), 0, 0
         for k in range(n):
             grad_b, grad_g, grad_c, g = grad_bias[k, 0], grad_gain[k, 0], grad_shift[k, 0], gain[k, 0]
             grad_b[:] = zero
@@ -158,28 +171,15 @@ def layer_backward(layer_norm: bool, dropout: bool, activation: int) -> Callable
                     for j in range(width):
                         d[j] = r * (d[j] - mean - x[j] * along)
                 if dropout:
-                    stays = mask[k, i]
+                    first, beyond = beyond, _mark(factors, zero, row_start, dropped, beyond)
                     for j in range(width):
-                        d[j] *= real(stays[j]) * kept
+                        d[j] *= factors[j]
+                    _mark(factors, kept, row_start, dropped, first)
+                    row_start += width
                 for j in range(width):
                     grad_b[j] += d[j]
 
     return backward
-
-
-@_compiled
-def zero_at_gaps(elements, gaps, position):
-    """
-    Set elements to 0, each so many after the one before, the first so many after ``position``.
-
-    Returns the place of the last one; beyond the end if the gaps reach there, else the next gaps are to go on from it.
-    """
-    for gap in gaps:
-        position += gap
-        if position >= elements.size:
-            break
-        elements[position] = 0
-    return position
 
 
 @_compiled

@@ -6,6 +6,8 @@ with Adam. They compute the same numbers up to rounding, on the same parameters 
 """
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -90,6 +92,11 @@ class CriticRegression:
         self.running_stats = get_parameters_by_name(critic, ["running_"])
         self.running_stats_target = get_parameters_by_name(critic_target, ["running_"])
 
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """While it lasts nobody loads critics or replaces parts of them: what was looked at once need not be again."""
+        yield
+
     def fit(
         self,
         observations: PyTorchObs,
@@ -172,14 +179,26 @@ class FusedRegression(CriticRegression):
     ) -> None:
         super().__init__(critic, critic_target, loss, reduction)
         self.bfloat16 = bfloat16
-        self._checked: dict[EnsembleCritic, tuple[list[Any], bool]] = {}  # its parts, and whether they can be fused
         self._networks: dict[EnsembleCritic, list[FusedNetwork]] = {}
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
         # Network, addresses of the optimiser's state and of the targets, all of them in the sweeps
         self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])
+        # While nothing changes: the passes that were looked up (None: none), and whether the sweeps are theirs
+        self._unchanged = False
+        self._known: dict[tuple[EnsembleCritic, int], FusedNetwork | None] = {}
+        self._sweeps_known = False
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_checked": {}, "_networks": {}, "_sweeps": [], "_swept": (None, [])}  # made again when needed
+        made_again: dict[str, Any] = {"_networks": {}, "_sweeps": [], "_swept": (None, []), "_known": {}}
+        return {**vars(self), **made_again, "_unchanged": False}
+
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        self._unchanged, self._known, self._sweeps_known = True, {}, False
+        try:
+            yield
+        finally:
+            self._unchanged = False
 
     def fit(
         self,
@@ -189,10 +208,10 @@ class FusedRegression(CriticRegression):
         tau: float,
         weights: th.Tensor | None = None,
     ) -> Fit:
-        if self._customised(self.critic):
+        network = self._passes(self.critic, actions.shape[0])
+        if network is None:
             return super().fit(observations, actions, target, tau, weights)
         with th.no_grad():
-            network = self._network(self.critic, len(actions))
             features = self.critic.extract_features(observations, self.critic.features_extractor)
             outputs = network.forward(features, actions)
             q_values = self.objective.values(outputs).clone()
@@ -202,48 +221,35 @@ class FusedRegression(CriticRegression):
             return Fit(loss.sum(), q_values)
 
     def q_values(self, observations: PyTorchObs, actions: th.Tensor) -> th.Tensor:
-        if self._customised(self.critic):
+        network = self._passes(self.critic, actions.shape[0])
+        if network is None:
             return super().q_values(observations, actions)
         with th.no_grad():
             features = self.critic.extract_features(observations, self.critic.features_extractor)
-        return _QValues.apply(actions, features, self._network(self.critic, len(actions)), self.objective)
+        return _QValues.apply(actions, features, network, self.objective)
 
     def target_q_values(self, observations: PyTorchObs, actions: th.Tensor, members: list[int] | None = None) -> th.Tensor:
-        if self._customised(self.critic_target):
+        network = self._passes(self.critic_target, actions.shape[0])
+        if network is None:
             return super().target_q_values(observations, actions, members)
         with th.no_grad():
             features = self.critic_target.extract_features(observations, self.critic_target.features_extractor)
-            outputs = self._network(self.critic_target, len(actions)).forward(features, actions, members)
-            return self.objective.values(outputs)
+            return self.objective.values(network.forward(features, actions, members))
 
-    def _customised(self, critic: EnsembleCritic) -> bool:
-        """
-        Whether something was replaced that cannot be fused, a layer is frozen, or there are hooks (to clip gradients, say):
-        autograd's business.
-        """
-        parts, optimizer = _parts(critic), _optimizer_of(critic)
-        known, fusable = self._checked.get(critic, ([], False))
-        if not are_same(parts, known):
-            fusable = not_fusable(critic) is None
-            self._checked[critic] = parts, fusable
-            self._networks.pop(critic, None)  # passes of what was replaced
-        if not fusable:
-            return True
-        modules = (critic, critic.q_networks, *critic.q_networks.layers)
-        if any(m._forward_hooks or m._forward_pre_hooks or m._backward_hooks or m._backward_pre_hooks for m in modules):
-            return True
-        if optimizer is None:
-            return False
-        wrapped = "step" in vars(optimizer) or optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks
-        return bool(wrapped) or any(
-            not each.requires_grad or each._backward_hooks or each._post_accumulate_grad_hooks
-            for each in optimizer.param_groups[0]["params"]
-        )
+    def _passes(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork | None:
+        """Hand-written passes of critics; ``None`` if something about them is autograd's business."""
+        key = critic, batch_size
+        if self._unchanged and key in self._known:
+            return self._known[key]
+        both = self.critic, self.critic_target
+        special = any(not_fusable(each) is not None or _has_more_than_passes(each) for each in both)
+        self._known[key] = None if special else self._network(critic, batch_size)
+        return self._known[key]
 
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
         known = self._networks.get(critic, [])
         for network in known:
-            if network.fits(batch_size):
+            if network.fits(critic.q_networks, batch_size):
                 return network
         others = (each for owner, networks in self._networks.items() if owner is not critic for each in networks)
         lenders = (each for each in others if len(each.input) == batch_size and each.resembles(critic.q_networks))
@@ -252,7 +258,17 @@ class FusedRegression(CriticRegression):
         return network
 
     def _step(self, network: FusedNetwork, tau: float) -> None:
-        """Adam and Polyak of all parameters, whose state is kept where torch's optimiser keeps it."""
+        """Adam and Polyak of all parameters."""
+        if not (self._unchanged and self._sweeps_known and network is self._swept[0]):
+            self._prepare_sweeps(network)
+            self._sweeps_known = True
+        group = self.critic.optimizer.param_groups[0]
+        decoupled = group.get("decoupled_weight_decay", isinstance(self.critic.optimizer, th.optim.AdamW))
+        for sweep in self._sweeps:
+            sweep(group["lr"], *group["betas"], group["eps"], group["weight_decay"], decoupled, tau)
+
+    def _prepare_sweeps(self, network: FusedNetwork) -> None:
+        """Over parameters and targets where they are, with states where torch's optimiser keeps them."""
         optimizer = self.critic.optimizer
         states = [optimizer.state[parameter] for parameter in network.parameters]
         targets = parameters_of(self.critic_target.q_networks)
@@ -260,6 +276,8 @@ class FusedRegression(CriticRegression):
             if not state:  # as Adam itself does at a parameter's first step
                 state["step"] = th.zeros((), dtype=th.float32)
                 state.update(exp_avg=th.zeros_like(parameter), exp_avg_sq=th.zeros_like(parameter))
+            for name in ("exp_avg", "exp_avg_sq"):  # others' may have been loaded
+                state[name] = state[name].contiguous()
         addresses = [state["exp_avg"].data_ptr() for state in states] + [target.data_ptr() for target in targets]
         if network is not self._swept[0] or addresses != self._swept[1]:  # another batch size; what was loaded lies elsewhere
             self._swept = (network, addresses)
@@ -268,24 +286,29 @@ class FusedRegression(CriticRegression):
                 tensors = (parameter, grad, state["exp_avg"], state["exp_avg_sq"], state["step"], target)
                 self._sweeps.append(partial(adam_polyak, *(array(tensor).reshape(-1) for tensor in tensors)))
 
-        group = optimizer.param_groups[0]
-        decoupled = group.get("decoupled_weight_decay", isinstance(optimizer, th.optim.AdamW))
-        for sweep in self._sweeps:
-            sweep(group["lr"], *group["betas"], group["eps"], group["weight_decay"], decoupled, tau)
-
 
 def _optimizer_of(critic: EnsembleCritic) -> th.optim.Optimizer | None:
     """Targets have none."""
     return getattr(critic, "optimizer", None)
 
 
-def _parts(critic: EnsembleCritic) -> list[Any]:
-    """All that :func:`not_fusable` looks at and that may be replaced."""
-    optimizer, network = _optimizer_of(critic), critic.q_networks
-    groups = [] if optimizer is None else optimizer.param_groups
-    held = [parameter for group in groups for parameter in group["params"]]
-    inner = [*network.layers, *parameters_of(network)] if isinstance(network, StackedMLP) else []
-    return [critic.features_extractor, network, *inner, optimizer, *groups, *held]
+def _has_more_than_passes(critic: EnsembleCritic) -> bool:
+    """
+    Whether more happens to fusable critics than their passes and Adam: hooks (to clip gradients, say), a frozen layer. Or
+    less: compiled loops would work on copies of what is not contiguous.
+    """
+    network, optimizer = critic.q_networks, _optimizer_of(critic)
+    modules = (critic, network, *network.layers)
+    if any(m._forward_hooks or m._forward_pre_hooks or m._backward_hooks or m._backward_pre_hooks for m in modules):
+        return True
+    parameters = parameters_of(network)
+    if not all(parameter.is_contiguous() for parameter in parameters):
+        return True
+    if optimizer is None:
+        return False
+    if "step" in vars(optimizer) or optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
+        return True
+    return any(p._backward_hooks or p._post_accumulate_grad_hooks or not p.requires_grad for p in parameters)
 
 
 def not_fusable(critic: EnsembleCritic) -> str | None:
@@ -310,13 +333,14 @@ def not_fusable(critic: EnsembleCritic) -> str | None:
         return None
     if type(optimizer) not in (th.optim.Adam, th.optim.AdamW):
         return f"the optimizer is {type(optimizer).__name__}, not Adam or AdamW"
-    if not optimizer.defaults["fused"]:
-        return f"the optimizer has fused={optimizer.defaults['fused']}"
     if len(optimizer.param_groups) > 1:
         return f"the optimizer has {len(optimizer.param_groups)} groups of parameters"
-    if not are_same(optimizer.param_groups[0]["params"], parameters_of(critic.q_networks)):
+    (group,) = optimizer.param_groups
+    if not group["fused"]:
+        return f"the optimizer has fused={group['fused']}"
+    if not are_same(group["params"], parameters_of(critic.q_networks)):
         return "the optimizer's parameters are not those of the critics"
-    special = [name for name in ("amsgrad", "maximize", "capturable", "differentiable") if optimizer.defaults[name]]
+    special = [name for name in ("amsgrad", "maximize", "capturable", "differentiable") if group[name]]
     return f"the optimizer has {special[0]}=True" if special else None
 
 
