@@ -73,6 +73,20 @@ def test_training_does_not_ask(make):
     }
 
 
+def test_weights_that_come_without_an_average_start_a_new_one(make, tmp_path):
+    kwargs = dict(actor_averaging=0.3)
+    plain, model = make().learn(60), make(policy_kwargs=kwargs, seed=5).learn(60)
+    plain.save(tmp_path / "plain")
+    model.save(tmp_path / "averaged")
+    answers = model.predict(OBSERVATIONS, deterministic=True)[0]
+    expected = plain.predict(OBSERVATIONS, deterministic=True)[0]
+    model.set_parameters(tmp_path / "plain", exact_match=False)
+    np.testing.assert_array_equal(model.predict(OBSERVATIONS, deterministic=True)[0], expected)
+    model.set_parameters(tmp_path / "averaged")  # with its own
+    np.testing.assert_array_equal(model.predict(OBSERVATIONS, deterministic=True)[0], answers)
+    assert not np.array_equal(answers, expected)
+
+
 @pytest.mark.parametrize("share", [False, True])
 def test_batch_normalisation(small, share):
     """Statistics are those of the actor, not an average of whole numbers."""

@@ -69,6 +69,11 @@ def test_members_are_rows_of_the_whole(layer_norm, members):
     th.testing.assert_close(critic(observations, actions, members), whole[members], rtol=1e-12, atol=1e-12)
 
 
+def test_activations_that_critics_would_share():
+    with pytest.raises(ValueError, match="activation_fn=PReLU: expected one without parameters"):
+        make_critic([8], n_critics=2, activation_fn=th.nn.PReLU)
+
+
 def test_no_two_critics_start_alike():
     th.manual_seed(0)
     observations, actions, _ = batch_of(4)

@@ -157,3 +157,14 @@ def test_batch_norm_of_the_target_never_uses_batch_statistics(make, dropout_rate
     norms = [part for part in model.critic_target.modules() if isinstance(part, nn.BatchNorm1d)]
     assert norms and not any(part.training for part in norms)
     assert all(part.training for part in model.critic.modules() if isinstance(part, nn.BatchNorm1d))
+
+
+@pytest.mark.parametrize("cls, policy_delay", [(REDQ, 5), (Symphony, 5), (DroQ, 1)])
+def test_batch_norm_has_statistics_of_each_minibatch(small, cls, policy_delay):
+    """Ten updates: as many passes for next actions, whose statistics those of SB3's actors are, too."""
+    model = small(cls, policy_delay=policy_delay, gradient_steps=1, learning_starts=20, **BATCH_NORM).learn(20)
+    before = model.actor.features_extractor.norm.num_batches_tracked.item()
+    model.train(10, 16)
+    passes = model.actor.features_extractor.norm.num_batches_tracked.item() - before
+    initial = sum(model.initial_gradient_steps) if cls is Symphony else 0
+    assert passes == (10 + initial) + (10 + initial) // policy_delay

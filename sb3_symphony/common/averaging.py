@@ -1,6 +1,7 @@
 """An average of the actor's recent weights, for when no exploration is wanted."""
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import torch as th
@@ -45,6 +46,20 @@ class AveragedActor(BasePolicy):
         if self.averaged_actor is not None:
             self.n_averaged.zero_()
             self.averaged_actor.load_state_dict(self.actor.state_dict())
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """
+        Torch's. An actor that comes without an average starts a new one.
+
+        :param state_dict: parameters by name
+        :param strict: whether all have to be there, and no others
+        :param assign: see torch
+        :return: names that are missing or unexpected
+        """
+        result = super().load_state_dict(state_dict, strict, assign)
+        if not any(name.startswith("averaged_actor.") for name in state_dict):
+            self.restart_average()
+        return result
 
     def average_actor(self) -> None:
         """Move the average toward the actor; to be called after each of its updates."""

@@ -126,6 +126,7 @@ class StackedMLP(nn.Module):
     :param output_dim: Size of their output
     :param hidden: See :func:`hidden_layers`
     :param init: Initialisation of the linear layers, ``"default"`` (as torch) or ``"xavier"``
+    :raises ValueError: if an activation has parameters, which the networks would share
     """
 
     def __init__(
@@ -134,6 +135,10 @@ class StackedMLP(nn.Module):
         super().__init__()
         linear = partial(StackedLinear, n_members, init=init)
         self.layers = nn.ModuleList(_modules(input_dim, output_dim, hidden, linear, partial(StackedLayerNorm, n_members)))
+        for layer in self.layers:
+            if not isinstance(layer, (StackedLinear, StackedLayerNorm)) and list(layer.parameters()):
+                kind = type(layer).__name__
+                raise ValueError(f"activation_fn={kind}: expected one without parameters, which the critics would share")
 
     def forward(self, x: th.Tensor, members: list[int] | None = None) -> th.Tensor:
         """

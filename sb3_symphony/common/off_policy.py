@@ -18,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, RolloutReturn, TrainFreq
+from stable_baselines3.common.utils import get_parameters_by_name
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import (
@@ -237,6 +238,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self.actor = self.policy.actor
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
+        self._has_batch_norm = bool(get_parameters_by_name(self.actor, ["running_"]))
         self._create_regression()  # of these critics
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
@@ -291,8 +293,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         if isinstance(self.replay_buffer, HerReplayBuffer | PrioritizedReplayBuffer):
             # Samples with their real goal come first, not to be cut; priorities change with every update
             updates_per_draw = 1
-        # With gSDE each update has noise of its own, as in SAC
-        longest = 1 if self.use_sde else max(1, MAX_SEGMENT_ROWS // batch_size)
+        # With gSDE each update has noise of its own, as in SAC; batch normalisation has statistics of its own
+        longest = 1 if self.use_sde or self._has_batch_norm else max(1, MAX_SEGMENT_ROWS // batch_size)
         while gradient_steps > 0:
             draw = min(gradient_steps, updates_per_draw)
             samples = self.replay_buffer.sample(draw * batch_size, env=self._vec_normalize_env, **sample_kwargs)
@@ -301,7 +303,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
                 until_actor = self.policy_delay - self._n_updates % self.policy_delay
                 length = min(draw - start, until_actor, longest)
                 batches = [_rows(samples, (start + i) * batch_size, batch_size) for i in range(length)]
-                yield _rows(samples, start * batch_size, length * batch_size), batches
+                with self._regression.unchanged():
+                    yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
             gradient_steps -= draw
 
@@ -413,7 +416,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        SB3's; the horizon of the buffer's returns and their discount become the model's.
+        SB3's; the horizon of the buffer's returns and their discount become the model's. All else (its class, fading,
+        priorities) stays what was saved, whatever ``replay_buffer_class`` and ``replay_buffer_kwargs`` say.
 
         :param truncate_last_traj: Whether the buffer's last episode ends there; else it is the one that the model is in
         :raises ValueError: if the model needs n-step returns and the buffer has none; the model's own buffer then stays
