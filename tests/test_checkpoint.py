@@ -147,6 +147,22 @@ def test_buffer_that_was_not_empty(tmp_path, small, pendulum, buffer_size):
     compared(tmp_path, lambda: small(REDQ, pendulum(), buffer_size=buffer_size).learn(45))
 
 
+def test_a_training_that_begins_anew(tmp_path, small, pendulum):
+    """Its reset ends the episode that was under way at the latest checkpoint."""
+    model = small(REDQ, pendulum())
+    record_episodes(model.env)
+    exact = ExactCheckpoints(tmp_path, 30)
+    exact.segments.small = 0  # write none of them again
+    for _ in range(2):
+        model.learn(40, callback=exact)
+        assert exact.save(rollout_follows=False)
+    stored, there = small(REDQ, pendulum()).replay_buffer, model.replay_buffer
+    ReplaySegments(tmp_path, newest_checkpoint(tmp_path).state["segments"]).load(stored)
+    assert there.timeouts[39] and not there.timeouts[79]
+    for name in ("observations", "dones", "timeouts"):
+        assert (getattr(stored, name) == getattr(there, name)).all()
+
+
 @pytest.mark.parametrize("buffer_size", [1000, 60])
 def test_a_training_that_goes_on(tmp_path, small, pendulum, buffer_size):
     """A second training with checkpoints, and a third one with the same callback; the count goes on."""

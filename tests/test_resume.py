@@ -728,7 +728,7 @@ def test_environment_that_cannot_be_replayed(killed, capsys):
     assert sum(int(row.split(",")[1]) for row in rows[1:]) <= 260
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signals_to_the_group(folder, number):
     """As `timeout` and Ctrl-C send them: to the run and, unless it has none there, to its environments' processes."""
     arguments = "train --algo sac --env Pendulum-v1 -n 1000000 --vec-env subproc --save-freq 100000 --verbose 0".split()

@@ -118,12 +118,21 @@ def test_entry_of_the_environment_comes_before_the_default(tmp_path):
         ("tau: 0.1", r"tau: 0.1 — expected \[choice, …\]"),
         ("default: {}", "space.yml: default: {} — expected a mapping"),
         ("- tau", "expected a mapping"),
+        ("Hopper-v5:\n  gamma: [0.9, 0.99]", "space.yml: no entry for 'BipedalWalker-v3'$"),
+        ("BipedalWalker-v2:\n  gamma: [0.9]", "no entry for 'BipedalWalker-v3': did you mean 'BipedalWalker-v2'"),
         ("tau: !!python/name:os.system", "refused"),
     ],
 )
 def test_mistakes(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         written(tmp_path, text + "\n")
+
+
+def test_what_the_command_line_gives_is_not_searched(tmp_path):
+    text = "n_timesteps: [100, 200]\ngamma: [0.9, 0.99]\ntau: [0.1]\n"
+    assert set(written(tmp_path, text).parameters) == {"n_timesteps", "gamma"}
+    space = written(tmp_path, text, n_timesteps=150, hyperparams={"tau": 0.2})
+    assert set(space.parameters) == {"gamma"} and space.fixed == {}
 
 
 def test_missing_file():

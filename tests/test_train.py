@@ -1,8 +1,13 @@
 """Short real runs: what they leave on disk, what is learned from, what is reported."""
 
+import fcntl
+import os
+import pty
+import select
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -17,10 +22,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_symphony.analysis.runs import find_runs, group_runs
 from sb3_symphony.cli import main
 from sb3_symphony.common.wrappers import FreshBox2DWorld
-from sb3_symphony.experiment.config import RunSettings, TrainOptions, load_config, reason
+from sb3_symphony.experiment.config import ConfigError, RunSettings, TrainOptions, load_config, reason
 from sb3_symphony.experiment.environment import EpisodeSeeds, make_evaluation_env, make_training_env
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import SelectOptions, select_model
+from sb3_symphony.experiment.signals import handled_by
 from sb3_symphony.experiment.train import train
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
@@ -289,7 +295,52 @@ def test_stopping_during_an_evaluation(monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("save_freq", [0, 50])
+def test_a_closed_terminal_saves_the_model(folder, save_freq):
+    """What is written then goes nowhere, and is no error."""
+    own, terminal = pty.openpty()
+    argv = f"train --algo td3 --env Pendulum-v1 -n 1000000 --eval-freq 0 --seed 0 --save-freq {save_freq}"
+    command = [sys.executable, "-m", "sb3_symphony", *argv.split(), "-params", "policy_kwargs.net_arch:[8]"]
+
+    def take_terminal():
+        fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+    process = subprocess.Popen(
+        command, stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True, preexec_fn=take_terminal
+    )
+    os.close(terminal)
+    monitor = folder / "logs/td3/Pendulum-v1_1/0.monitor.csv"
+    deadline = time.monotonic() + 60
+    while not (monitor.exists() and monitor.read_text().count("\n") > 3):
+        assert process.poll() is None and time.monotonic() < deadline
+        if select.select([own], [], [], 0.1)[0]:
+            os.read(own, 4096)
+    os.close(own)
+    assert process.wait(timeout=60) == 130
+    assert TD3.load(monitor.parent / "Pendulum-v1.zip").num_timesteps >= 400
+
+
+def test_a_hang_up_that_is_ignored_stays_so():
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with handled_by(pytest.fail):
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_hindsight_replay_before_an_episode_has_ended(folder):
+    where = "stable_baselines3.common.envs:BitFlippingEnv"
+    gym.register("Flip-v0", where, kwargs={"n_bits": 12, "continuous": True, "max_steps": 30})
+    settings = "n_timesteps: 100\npolicy: MultiInputPolicy\nreplay_buffer_class: HerReplayBuffer\nlearning_starts: 10\n"
+    (folder / "her.yml").write_text(settings)
+    with pytest.raises(ConfigError, match="learning_starts: 10 — no episode had ended after 11 steps"):
+        train(options("sac", "Flip-v0", -1, hyperparams={}, conf_file="her.yml"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interruption_saves_the_model(folder, number):
     argv = "train --algo td3 --env Pendulum-v1 -n 1000000 --eval-freq 0 --seed 0 --verbose 0 -params learning_starts:100000"
     command = [sys.executable, "-m", "sb3_symphony", *argv.split(), "buffer_size:1000", "policy_kwargs.net_arch:[8]"]

@@ -273,6 +273,7 @@ class ExactCheckpoints(BaseCallback):
         if self._restoring is None and buffer is not None:  # that of an earlier training may have rows, and the count go on
             rows = buffer.pos + buffer.buffer_size * buffer.full
             self._rows_before = rows - self.model.num_timesteps // self.model.n_envs
+            self.segments.forget_latest()  # which a reset has made the end of an episode
 
     def _on_rollout_start(self) -> None:
         if self._restoring is not None:

@@ -104,14 +104,14 @@ def bench(options: BenchOptions) -> BenchResult:
     """
     if options.address is not None and options.backend != "ray":
         raise ConfigError(f"--address: '{options.address}' — is for --backend ray")
-    if options.page is not None:
-        on_page(options.page, "")
     if options.dry_run and options.report:
         raise ConfigError("--dry-run and --report: expected only one of them")
     path = Path(options.study)
     for flag in ("page", "collect"):
         if getattr(options, flag) is not None and not options.report:
             raise ConfigError(f"--{flag}: '{getattr(options, flag)}' — belongs to --report")
+    if options.page is not None:
+        on_page(options.page, "")
     study = read_study(path, options.quick, options.algo)
     name = path.absolute().parent.name if path.stem == "study" else path.stem
     study = study.model_copy(update={"title": study.title or name})

@@ -1,25 +1,48 @@
-"""Ctrl-C and requests to terminate, answered without leaving anything half done."""
+"""Ctrl-C, requests to terminate and closed terminals, answered without leaving anything half done."""
 
+import os
 import signal
+import stat
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
+
+Handler = Callable[[int, Any], None]
 
 
 @contextmanager
-def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
+def handled_by(handler: Handler) -> Iterator[None]:
     """
-    Handle SIGINT and SIGTERM inside the block, where Python allows it (the main thread).
+    Handle SIGINT, SIGTERM and SIGHUP inside the block, where Python allows it (the main thread). SIGHUP tells that the
+    terminal is closed; ``nohup`` has it ignored, and it stays so.
 
     :param handler: called with the signal's number and the current frame
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers: dict[int, Handler] = {signal.SIGINT: handler, signal.SIGTERM: handler}
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # Windows has none
+        handlers[signal.SIGHUP] = _without_terminal(handler)
+    before = {number: signal.signal(number, own) for number, own in handlers.items()}
     try:
         yield
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)
+
+
+def _without_terminal(handler: Handler) -> Handler:
+    """The same once nothing goes to the terminal any more: to write there would be an error."""
+
+    def hung_up(signum: int, frame: Any) -> None:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for output in (1, 2):
+            with suppress(OSError):  # closed
+                if stat.S_ISCHR(os.fstat(output).st_mode):
+                    os.dup2(nowhere, output)
+        os.close(nowhere)
+        handler(signum, frame)
+
+    return hung_up

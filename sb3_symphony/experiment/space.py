@@ -13,6 +13,7 @@ Neither torch nor Optuna is imported here.
 
 import json
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -289,7 +290,7 @@ def _choice(where: str, values: list[Any]) -> Choice:
 def read_space(options: TuneOptions) -> SearchSpace:
     """
     Read the search space: the environment's entry, else ``default``, of the given file or the one that is shipped for the
-    algorithm; a file without such entries is one space. What ``-params`` gives is not searched.
+    algorithm; a file without such entries is one space. What ``-params`` and ``-n`` give is not searched.
 
     :param options: options of the command line
     :return: the space; its names and values are yet to be checked against the algorithm
@@ -302,13 +303,16 @@ def read_space(options: TuneOptions) -> SearchSpace:
         if name in content:
             where, content = f"{path}: {name}", content[name]
             break
+    else:
+        if any(re.search(r"-v\d+$", str(key)) for key in content):  # no hyper-parameter ends like that
+            raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     space = parse_space(content, where)
-    given = options.hyperparams
+    given = {*options.hyperparams, *(["n_timesteps"] if options.n_timesteps > 0 else [])}
     parameters = {name: parameter for name, parameter in space.parameters.items() if name not in given}
     if not parameters:
         raise ConfigError(
             f"{where}: nothing is left to search — expected a hyper-parameter with more than one choice that -params "
-            "does not give"
+            "and -n do not give"
         )
     return SearchSpace(where, parameters, {name: value for name, value in space.fixed.items() if name not in given})
 

@@ -259,6 +259,21 @@ def _nothing_lost(model: BaseAlgorithm, run: RunFolder) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def _hindsight_told(model: BaseAlgorithm) -> Iterator[None]:
+    """Hindsight replay draws from episodes that have ended: whether one has, when learning starts, only shows there."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "before the end of the first episode" not in str(error):
+            raise
+        starts = getattr(model, "learning_starts", 0)
+        raise ConfigError(
+            f"learning_starts: {starts} — no episode had ended after {model.num_timesteps} steps, and hindsight replay needs "
+            "one; expected more steps than an episode has"
+        ) from None
+
+
 def effective_config(options: TrainOptions) -> RunConfig:
     """
     :param options: options of the command line
@@ -425,7 +440,7 @@ def _train(
     written = [run.path, *([Path(options.tensorboard_log)] if options.tensorboard_log else [])]
     with stop.listening(), full_disk_told(written, onward):
         try:
-            with _nothing_lost(model, run) if checkpoints is None else nullcontext():
+            with _hindsight_told(model), _nothing_lost(model, run) if checkpoints is None else nullcontext():
                 model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:
             stop.requested = True
