@@ -1,6 +1,9 @@
 """Evaluation: what is played, what is reported, and that it does not depend on the number of processes."""
 
 import json
+import subprocess
+import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import pytest
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv
+from tune_helpers import descendants
 
 from sb3_symphony.cli import main
 from sb3_symphony.experiment.config import ConfigError
@@ -88,6 +92,21 @@ def test_results_do_not_depend_on_the_number_of_processes(walker):
     assert one.episodes == two.episodes  # to the last bit
     later = evaluate(EvaluateOptions(**{**conditions, "seed": 5, "n_episodes": 3}))
     assert later.episodes == one.episodes[2:]  # nor on the episodes before
+
+
+def test_processes_end_with_the_one_that_was_killed(pendulum):
+    argv = [f"--{name}={value}" for name, value in pendulum.items()]
+    command = [sys.executable, "-m", "sb3_symphony", "evaluate", *argv, "-n", "100000", "--n-envs", "2"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 90
+    while len(workers := descendants(process.pid)) < 3:  # multiprocessing's tracker of resources is one of them
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    process.kill()
+    process.wait()
+    while any(Path(f"/proc/{worker}").exists() for worker in workers):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def test_numbers(pendulum, folder):

@@ -18,6 +18,7 @@ from sb3_symphony.experiment.environment import Wrappers
 from sb3_symphony.experiment.output import progress_bar, report
 from sb3_symphony.experiment.robustness import ActionDelay, ObservationNoise
 from sb3_symphony.experiment.select import EvaluateOptions, Selection
+from sb3_symphony.experiment.signals import end_with_parent
 
 
 class Episode(NamedTuple):
@@ -141,6 +142,7 @@ _agent: Agent
 def _start(options: EvaluateOptions) -> None:
     global _agent
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent answers
+    end_with_parent()
     with contextlib.redirect_stderr(io.StringIO()):  # the parent has told
         _agent = _open(options)
 

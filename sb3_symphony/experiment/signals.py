@@ -1,5 +1,6 @@
-"""Ctrl-C, requests to terminate and closed terminals, answered without leaving anything half done."""
+"""Ctrl-C, requests to terminate and closed terminals, answered without leaving anything half done, or running."""
 
+import multiprocessing
 import os
 import signal
 import stat
@@ -31,6 +32,18 @@ def handled_by(handler: Handler) -> Iterator[None]:
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)
+
+
+def end_with_parent() -> None:
+    """End this process when the one that started it has ended in any way."""
+    parent = multiprocessing.parent_process()
+
+    def wait() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _without_terminal(handler: Handler) -> Handler:

@@ -5,11 +5,9 @@ A crash, a lack of memory or a diverging network then ends one trial and nothing
 """
 
 import multiprocessing
-import os
 import signal
 import sys
 import textwrap
-import threading
 import traceback
 import warnings
 from collections.abc import Sequence
@@ -27,6 +25,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_symphony.experiment.callbacks import SeededEvaluation, StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
 from sb3_symphony.experiment.environment import make_evaluation_env
+from sb3_symphony.experiment.signals import end_with_parent
 from sb3_symphony.experiment.train import build_callbacks, build_model
 
 
@@ -99,17 +98,10 @@ def _failure(error: Exception, model: BaseAlgorithm | None) -> _Failure:
     return _Failure("".join(traceback.format_exception(error)), "error")
 
 
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
 def _train_seed(options: TrainOptions, config: RunConfig, seed: int, n_evaluations: int, results: Connection) -> None:
     """What the process of a training does: the same as ``train``, but for files."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the sweep decides
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     ignore_mini_batches()
     if options.num_threads > 0:
         th.set_num_threads(options.num_threads)
