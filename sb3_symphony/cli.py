@@ -85,6 +85,26 @@ _PLOT_EXAMPLES = """examples:
 _SEVERAL: Any = {"action": "extend", "nargs": "+"}  # a flag that is given twice adds to what it was
 
 
+_SEARCHES = (
+    "-optimize",
+    "--optimize-hyperparameters",
+    "--n-trials",
+    "--sampler",
+    "--pruner",
+    "--n-startup-trials",
+    "--n-evaluations",
+    "--storage",
+    "--study-name",
+)
+_TRACKS = ("--track", "--uuid", "-uuid", "-tags", "--wandb-tags", "--wandb-project-name", "--wandb-entity", "--wandb-group")
+# Flags of RL Zoo's train that ours lacks, and what has them
+_OF_RL_ZOO = {
+    **dict.fromkeys(_SEARCHES, "sb3-symphony tune"),
+    **dict.fromkeys(_TRACKS, "python -m sb3_symphony.zoo train"),
+    "--save-replay-buffer": "--save-freq N, whose checkpoints hold it",
+}
+
+
 class _Parser(argparse.ArgumentParser):
     """Tells a mistake in one line, with the nearest valid spelling."""
 
@@ -100,7 +120,10 @@ class _Parser(argparse.ArgumentParser):
         """
         :param argument: an argument that no command takes
         """
-        self.error(f"unknown argument '{argument}'{suggestion(argument, self._option_string_actions)}")
+        near = suggestion(argument, self._option_string_actions)
+        if self.prog.endswith(" train") and argument in _OF_RL_ZOO:
+            near = f" — RL Zoo's, for which there is {_OF_RL_ZOO[argument]}"
+        self.error(f"unknown argument '{argument}'{near}")
 
     def takes(self, option: str) -> bool:
         """

@@ -166,6 +166,9 @@ def test_flags_reach_the_options(monkeypatch):
         ("--device quantum", "--device: 'quantum' is not there"),
         ("--verbose 5", "expected one of 0, 1, 2"),
         ("--sed 1", "unknown argument '--sed': did you mean '--seed'?"),
+        ("-optimize", "unknown argument '-optimize' — RL Zoo's, for which there is sb3-symphony tune"),
+        ("--track", "RL Zoo's, for which there is python -m sb3_symphony.zoo train"),
+        ("--save-replay-buffer", "RL Zoo's, for which there is --save-freq N, whose checkpoints hold it"),
     ],
 )
 def test_mistakes(capsys, folder, arguments, message):
