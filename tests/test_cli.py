@@ -254,6 +254,7 @@ def test_unknown_command(capsys):
         ("- 1\n", "expected a mapping"),
         ("", "expected a mapping"),
         ("Pendulum-v1: 5", "expected a mapping of hyper-parameters"),
+        ("gamma: 0.9\nPendulum-v1: {gamma: 0.8}", "'gamma' stands beside the entry 'Pendulum-v1' — expected inside it"),
         ("Pendulum-v2: {n_timesteps: 5}", "did you mean 'Pendulum-v2'"),
         ("policy: MlpPolicy", "n_timesteps: missing"),
         ("{n_timesteps: 10, policy_kwargs: \"__import__('os').mkdir('owned')\"}", "policy_kwargs: '__import__"),

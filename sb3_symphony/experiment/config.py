@@ -369,6 +369,21 @@ def check_algorithm(name: str, known: Iterable[str] = ALGORITHMS) -> None:
         raise ConfigError(f"unknown algorithm '{name}'{near}")
 
 
+def entry_name(content: Mapping[str, Any], env: str, path: Path) -> str | None:
+    """
+    :param content: content of a file with an entry for each environment, or with nothing but one
+    :param env: environment
+    :param path: the file, for messages
+    :return: its entry, else ``default``; ``None``: the file has neither
+    :raises ConfigError: if values stand beside that entry, which would not be used
+    """
+    name = next((name for name in (env, without_module(env), "default") if name in content), None)
+    beside = [key for key, value in content.items() if name is not None and key != name and not isinstance(value, dict)]
+    if beside:
+        raise ConfigError(f"{path}: '{beside[0]}' stands beside the entry '{name}' — expected inside it")
+    return name
+
+
 def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
     """
     Look up the environment's entry, else ``default``, in the given file or preset or the shipped file; a flat file is its own.
@@ -387,11 +402,11 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
         near = suggestion(path, presets) or f" — expected a YAML file or one of {', '.join(sorted(presets))}"
         raise ConfigError(f"-conf: no such file or preset '{path}'{near}")
     content = read_yaml(path)
-    for name in (options.env, without_module(options.env), "default"):
-        if name in content:
-            if not isinstance(content[name], dict):
-                raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")
-            return f"{path.name}, {name}" if options.conf_file is None else f"-conf {path}, {name}", content[name]
+    name = entry_name(content, options.env, path)
+    if name is not None:
+        if not isinstance(content[name], dict):
+            raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")
+        return f"{path.name}, {name}" if options.conf_file is None else f"-conf {path}, {name}", content[name]
     if content and all(isinstance(value, dict) and "n_timesteps" in value for value in content.values()):
         raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     return f"-conf {path}", content

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from sb3_symphony.common.checks import suggestion
-from sb3_symphony.experiment.config import ConfigError, Threads, TrainOptions, read_yaml, shipped_folder
-from sb3_symphony.experiment.registry import without_folder, without_module
+from sb3_symphony.experiment.config import ConfigError, Threads, TrainOptions, entry_name, read_yaml, shipped_folder
+from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
 if TYPE_CHECKING:
@@ -299,13 +299,11 @@ def read_space(options: TuneOptions) -> SearchSpace:
     path = Path(shipped_folder() / "tuning" / f"{options.algo}.yml" if options.space is None else options.space)
     content = read_yaml(path)
     where = str(path)
-    for name in (options.env, without_module(options.env), "default"):
-        if name in content:
-            where, content = f"{path}: {name}", content[name]
-            break
-    else:
-        if any(re.search(r"-v\d+$", str(key)) for key in content):  # no hyper-parameter ends like that
-            raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
+    name = entry_name(content, options.env, path)
+    if name is not None:
+        where, content = f"{path}: {name}", content[name]
+    elif any(re.search(r"-v\d+$", str(key)) for key in content):  # no hyper-parameter ends like that
+        raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     space = parse_space(content, where)
     given = {*options.hyperparams, *(["n_timesteps"] if options.n_timesteps > 0 else [])}
     parameters = {name: parameter for name, parameter in space.parameters.items() if name not in given}
