@@ -93,12 +93,14 @@ def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
                 x = product[s, i]
                 y = x if in_place else out[s, i]
                 mean, variance = zero, zero
-                first, beyond = beyond, _mark(factors, zero, row_start, dropped, beyond)
+                if dropout:
+                    first, beyond = beyond, _mark(factors, zero, row_start, dropped, beyond)
                 for j in range(width):
                     x[j] = (x[j] + b[j]) * factors[j] if dropout else x[j] + b[j]
                     mean += x[j]
-                _mark(factors, kept, row_start, dropped, first)
-                row_start += width
+                if dropout:
+                    _mark(factors, kept, row_start, dropped, first)
+                    row_start += width
                 if layer_norm:
                     mean *= scale
                     for j in range(width):
