@@ -312,7 +312,7 @@ def test_own_robot(folder, monkeypatch, capsys):
     assert main(f"train --algo sac {argv} -n 60 --eval-freq 0 --quiet --seed 1 {small}".split()) == 0
     assert main(f"evaluate --algo sac {argv} -n 2".split()) == 0
     assert main("train --algo sac --env Xyzzy-v0".split()) == 2
-    assert "--gym-packages" in capsys.readouterr().err
+    assert "(one's own: MODULE:Xyzzy-v0; most commands have --gym-packages)" in capsys.readouterr().err
 
 
 KINDS_ENV = """
