@@ -211,7 +211,8 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
         raise ConfigError(f"environment '{env_id}' cannot be made — {message}") from None
     except gym.error.UnregisteredEnv:
         near = suggestion(env_id, gym.registry) or " — expected a registered id such as BipedalWalker-v3"
-        raise ConfigError(f"unknown environment '{env_id}'{near} (one's own: MODULE:{env_id}; most commands have --gym-packages)") from None
+        own = f"one's own: MODULE:{env_id}; most commands have --gym-packages"
+        raise ConfigError(f"unknown environment '{env_id}'{near} ({own})") from None
     except gym.error.Error as error:
         raise ConfigError(f"environment '{env_id}' cannot be made — {error}") from None
     except (TypeError, ValueError, AssertionError, OSError) as error:
