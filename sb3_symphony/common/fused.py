@@ -96,7 +96,7 @@ def all_members(n: int) -> np.ndarray:
     return np.arange(n)
 
 
-NOTHING = np.zeros(0, dtype=np.int64)
+NOTHING = np.zeros(0, dtype=np.int64)  # positions of what is dropped where nothing is
 
 
 class Products:

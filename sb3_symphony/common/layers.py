@@ -45,7 +45,7 @@ def draw_dropped(n_elements: int, rate: float) -> np.ndarray:
     while drawn[-1][-1] < n_elements:  # once, nearly always
         gaps = th.empty(int(1.2 * rate * n_elements) + 8, dtype=th.int64).geometric_(rate).numpy()
         drawn.append(np.cumsum(gaps) + drawn[-1][-1])
-    positions = np.concatenate(drawn[1:]) if len(drawn) > 2 else drawn[1]
+    positions = np.concatenate(drawn[1:])
     return positions[: positions.searchsorted(n_elements)]
 
 
