@@ -173,6 +173,15 @@ def test_update_ratio_after_a_second_learn(make, algorithm):
     assert all(ratio > 0 for ratio in ratios) and ratios[-1] == 1.0
 
 
+def test_update_ratio_of_a_second_training_as_long_as_the_first(make, algorithm):
+    """Its first updates come when the count is what it was at the latest ones of the first."""
+    model = make(train_freq=50, gradient_steps=5, **no_extra_updates(algorithm))
+    for _ in range(2):
+        model.learn(50, log_interval=None)
+        assert model.logger.name_to_value["train/update_ratio"] == pytest.approx(5 / (50 - model.learning_starts))
+        model.dump_logs()
+
+
 @pytest.mark.parametrize("n_envs", [1, 2])
 @pytest.mark.parametrize(
     "noise, expected",

@@ -11,12 +11,12 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_symphony import REDQ, Symphony
 from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
-from sb3_symphony.common.checkpoint import ExactCheckpoints, newest_checkpoint
+from sb3_symphony.common.checkpoint import ExactCheckpoints, checkpoint_files, newest_checkpoint
 from sb3_symphony.common.files import DamagedFile
 from sb3_symphony.common.recording import RecordedEpisode, record_episodes
 from sb3_symphony.common.replay_files import ReplaySegments
@@ -178,6 +178,48 @@ def test_a_training_that_goes_on(tmp_path, small, pendulum, buffer_size):
         stored, there = (getattr(each.replay_buffer, name) for each in (model, resumed))
         assert (stored == there).all()
     assert resumed.num_timesteps == model.num_timesteps == 125
+
+
+@pytest.mark.parametrize("buffer_size, replaced", [(60, False), (400, True)])
+def test_a_buffer_that_the_latest_checkpoint_does_not_know(tmp_path, small, pendulum, buffer_size, replaced):
+    """It has wrapped more than twice since it was empty, or was loaded."""
+    model = small(REDQ, pendulum(), buffer_size=buffer_size)
+    record_episodes(model.env)
+    exact = ExactCheckpoints(tmp_path, 30)
+    exact.segments.small = 0  # write nothing again
+    model.learn(125, callback=exact)
+    if replaced:
+        small(REDQ, pendulum(), buffer_size=buffer_size, seed=7).learn(200).save_replay_buffer(tmp_path / "other.pkl")
+        model.load_replay_buffer(tmp_path / "other.pkl")
+    model.learn(40, reset_num_timesteps=False, callback=exact)
+    assert exact.save(rollout_follows=False)
+    stored, there = small(REDQ, pendulum(), buffer_size=buffer_size).replay_buffer, model.replay_buffer
+    ReplaySegments(tmp_path, newest_checkpoint(tmp_path).state["segments"]).load(stored)
+    for name in ("observations", "actions", "rewards", "dones", "timeouts"):
+        assert (getattr(stored, name) == getattr(there, name)).all()
+
+
+def test_checkpoints_of_a_count_that_restarts(tmp_path, small, pendulum):
+    model = small(REDQ, pendulum())
+    record_episodes(model.env)
+    exact = ExactCheckpoints(tmp_path, 30, keep=5)
+    model.learn(100, callback=exact)
+    assert sorted(checkpoint_files(tmp_path)) == [30, 60, 90]
+    model.learn(70, callback=exact)
+    assert sorted(checkpoint_files(tmp_path)) == [30, 60]
+    assert newest_checkpoint(tmp_path).state["segments"][-1].stop == 160
+
+
+def test_returns_that_a_vec_monitor_adds_up(tmp_path, small, pendulum):
+    def episodes(steps, checkpoint=None):
+        model = small(REDQ, VecMonitor(pendulum()))
+        record_episodes(model.env)
+        model.learn(steps, callback=ExactCheckpoints(tmp_path, 160, checkpoint=checkpoint))
+        return [(episode["r"], episode["l"]) for episode in model.ep_info_buffer]
+
+    assert len(episodes(165)) == 6
+    resumed = episodes(230, newest_checkpoint(tmp_path))  # from the middle of an episode
+    assert resumed == episodes(230) and len(resumed) == 9
 
 
 def test_a_callback_may_change_the_exponent_of_weights(tmp_path, small, pendulum):

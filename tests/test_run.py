@@ -420,6 +420,15 @@ def test_memory_optimised_buffer(small):
     assert model.replay_buffer.optimize_memory_usage
 
 
+def test_an_overwritten_row_does_not_stay_the_end_of_a_trajectory(make):
+    """SB3 itself writes no timeouts here."""
+    model = make(buffer_size=20, replay_buffer_kwargs=dict(handle_timeout_termination=False)).learn(10)
+    model.learn(15)
+    assert model.replay_buffer.timeouts[9]
+    model.learn(10, reset_num_timesteps=False)
+    assert not model.replay_buffer.timeouts[9]
+
+
 # ---------------------------------------------------------------- several environments and exploration noise
 
 

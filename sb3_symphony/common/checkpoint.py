@@ -269,11 +269,13 @@ class ExactCheckpoints(BaseCallback):
         return self._restoring is None
 
     def _init_callback(self) -> None:
-        buffer = self._buffer
-        if self._restoring is None and buffer is not None:  # that of an earlier training may have rows, and the count go on
+        if self._restoring is not None:
+            return
+        self._latest = min(self._latest, self.model.num_timesteps)  # whose count may have restarted
+        if (buffer := self._buffer) is not None:  # that of an earlier training may have rows; others may have been loaded
             rows = buffer.pos + buffer.buffer_size * buffer.full
             self._rows_before = rows - self.model.num_timesteps // self.model.n_envs
-            self.segments.forget_latest()  # which a reset has made the end of an episode
+            self.segments.segments, self.segments.saved = [], 0
 
     def _on_rollout_start(self) -> None:
         if self._restoring is not None:

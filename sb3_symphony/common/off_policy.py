@@ -257,6 +257,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         result = super()._setup_learn(*args, **kwargs)
         if self._last_obs is not last_obs:
             self.start_anew()
+        self._timesteps_at_update = min(self._timesteps_at_update, self.num_timesteps)  # whose count may have restarted
         return result
 
     def start_anew(self) -> None:
@@ -265,6 +266,11 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             end_trajectory(self.replay_buffer)
 
     # ---------------------------------------------------------------- training
+
+    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
+        # SB3 writes it only if it handles timeouts, end_trajectory() always: a row overwritten later would keep it
+        replay_buffer.timeouts[replay_buffer.pos] = 0
+        super()._store_transition(replay_buffer, *args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         rollout = super().collect_rollouts(*args, **kwargs)
@@ -359,8 +365,6 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             self.logger.record(f"train/{key}", value)
         self.logger.record("train/noise_std", float(noise_std))
 
-        if self.num_timesteps < self._timesteps_at_update:  # learn() was called anew and the count restarted
-            self._timesteps_at_update = 0
         # Steps of the warm-up have no updates
         self._logged_transitions += max(1, self.num_timesteps - max(self._timesteps_at_update, self.learning_starts))
         self._timesteps_at_update = self.num_timesteps

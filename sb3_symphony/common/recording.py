@@ -248,8 +248,12 @@ def each_copy(env: VecEnv, method: str, states: Sequence[dict[str, Any]]) -> lis
     return [env.env_method(method, state, indices=[index])[0] for index, state in enumerate(states)]
 
 
-# What wrappers of vectorised environments know: VecNormalize (its own pickle drops the returns) and VecFrameStack
-_VEC_ENV_STATE = ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward", "stacked_obs")
+# What wrappers of vectorised environments know: VecNormalize (its own pickle drops the returns), VecFrameStack, VecMonitor
+_VEC_ENV_STATE = (
+    *("obs_rms", "ret_rms", "returns", "old_obs", "old_reward"),
+    "stacked_obs",
+    *("episode_returns", "episode_lengths", "episode_count"),
+)
 
 
 def _vec_wrappers(env: VecEnv) -> Iterator[VecEnvWrapper]:
