@@ -82,7 +82,7 @@ def test_layer_norm_of_the_reference():
 @pytest.mark.parametrize("shape", [(2, 64, 128), (7,), (1,)])
 def test_dropout_drops_each_element_with_the_same_probability_independently(rate, shape):
     th.manual_seed(0)
-    n_masks = 100 if len(shape) > 1 else 200_000 // shape[0]
+    n_masks = 100 if len(shape) > 1 else 10_000
     layer, ones = Dropout(rate), th.ones(shape)
     masks = th.stack([layer(ones) for _ in range(n_masks)])
     assert masks.unique().tolist() == pytest.approx([0, 1 / (1 - rate)])
