@@ -231,23 +231,23 @@ def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     options = validated(TrainOptions, arguments)
     check_algorithm(options.algo)  # before the slow imports
 
-    from sb3_symphony.experiment.output import report
+    from sb3_symphony.experiment.output import json_report
 
     if only_show:
         from sb3_symphony.experiment.dry_run import as_yaml, dry_run
 
-        with report(options.json_file) as tell:
-            values = dry_run(options)
-            tell({key: {"value": value, "source": source} for key, (value, source) in values.items()})
+        tell = json_report(options.json_file)
+        values = dry_run(options)
+        tell({key: {"value": value, "source": source} for key, (value, source) in values.items()})
         if options.json_file != "-":
             print(as_yaml(options, values))
         return 0
 
     from sb3_symphony.experiment.train import train_seeds
 
-    with report(options.json_file) as tell:
-        results = train_seeds(options, command=shlex.join(["sb3-symphony", *argv]))
-        tell({"runs": [result.plain() for result in results]})
+    tell = json_report(options.json_file)
+    results = train_seeds(options, command=shlex.join(["sb3-symphony", *argv]))
+    tell({"runs": [result.plain() for result in results]})
     if not options.quiet:
         print(results[-1].summary())
     return 130 if results[-1].interrupted else 0

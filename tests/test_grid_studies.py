@@ -348,7 +348,13 @@ def test_raw_files_give_the_same_tables(study, tmp_path, fails):
 def test_raw_files_of_moved_results(study, tmp_path):
     moved, raw = tmp_path / "moved", tmp_path / "raw"
     shutil.copytree(study / "results", moved)
+    with (moved / "base" / "Pendulum-v1_3" / "Pendulum-v1" / "config.yml").open("a") as config:
+        config.write(f"# {moved}/a, {moved}\n# {tmp_path}/move/a, {tmp_path}/movedother/a\n")
     assert main(["bench", str(study / "study.yml"), "--report", "-f", str(moved), "--collect", str(raw)]) == 0
+    config = raw / "base" / "Pendulum-v1_3" / "Pendulum-v1" / "config.yml"
+    kept = f"# {tmp_path}/move/a, {tmp_path}/movedother/a\n"  # other folders, whose names begin alike
+    assert config.read_text().endswith(f"# a, .\n{kept}")
+    config.write_text(config.read_text().removesuffix(kept))
     files = [path for path in raw.rglob("*") if path.is_file()]
     assert not any(str(folder).encode() in path.read_bytes() for path in files for folder in (study, moved))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file, output_folder, report, write_output
+from sb3_symphony.experiment.output import json_report, output_file, output_folder, write_output
 
 
 @contextmanager
@@ -48,14 +48,14 @@ def test_results_are_told_if_they_cannot_be_written(folder, monkeypatch, capsys)
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with report("a.json") as tell, pytest.raises(ConfigError, match=r"--json: 'a\.json' cannot be written — No space left"):
+    tell = json_report("a.json")
+    with pytest.raises(ConfigError, match=r"--json: 'a\.json' cannot be written — No space left"):
         tell({"mean_reward": 3})
     assert json.loads(capsys.readouterr().out) == {"mean_reward": 3} and not list(folder.iterdir())
 
 
 def test_json_has_null_for_what_is_not_finite(capsys):
-    with report("-") as tell:
-        tell({"a": [1.0, float("nan")], "b": {"c": (float("inf"), 2)}})
+    json_report("-")({"a": [1.0, float("nan")], "b": {"c": (float("inf"), 2)}})
     assert json.loads(capsys.readouterr().out) == {"a": [1.0, None], "b": {"c": [None, 2]}}
 
 

@@ -303,6 +303,14 @@ def test_own_algorithm_of_another_folder(folder, capsys):
     assert train(TrainOptions(resume=str(run), algo=own, n_timesteps=80)).steps == 80
 
 
+def test_own_on_policy_algorithm(folder):
+    """It may have what off-policy ones may not: discrete actions, and stacked frames that are normalised."""
+    (folder / "my_own_ppo.py").write_text("from stable_baselines3 import PPO\nclass Own(PPO):\n    pass\n")
+    small = {"n_envs": 1, "n_steps": 32, "batch_size": 32, "normalize": True, "frame_stack": 2}
+    own = options(f"{folder}/my_own_ppo.py:Own", env="CartPole-v1", conf_file="ppo", n_timesteps=32, hyperparams=small)
+    assert train(own).steps == 32
+
+
 def test_own_robot(folder, monkeypatch, capsys):
     """Trained, then used by another command."""
     (folder / "my_robot2.py").write_text(OWN_ENV.replace("Robot", "Robot2"))

@@ -65,7 +65,7 @@ def test_a_run_is_found_with_the_module_of_its_environment():
     for env in ("Pendulum-v1", "gymnasium:Pendulum-v1"):
         assert select_model(SelectOptions(algo="td3", env=env)).settings.env_kwargs == {"g": 5.0}
     other = train(options(env="gymnasium:Pendulum-v1", env_kwargs={"g": 5.0}, n_timesteps=60, seed=2)).run
-    (group,) = group_runs(find_runs(other.path.parents[1], [], []))
+    (group,) = group_runs(find_runs(other.path.parents[1]))
     assert group.env == "Pendulum-v1" and len(group.runs) == 2
 
 
@@ -274,7 +274,7 @@ def test_errors_while_learning_cost_no_model(monkeypatch, capsys):
     monkeypatch.setattr(PendulumEnv, "step", stumble)
     with pytest.raises(ZeroDivisionError):
         train(options())
-    (run,) = find_runs(Path("logs"), [], [])
+    (run,) = find_runs(Path("logs"))
     assert TD3.load(run.path / "Pendulum-v1.zip").num_timesteps == 70
     assert capsys.readouterr().err == f"note: saved {run.path / 'Pendulum-v1.zip'}, of 70 steps\n"
 
@@ -290,7 +290,7 @@ def test_stopping_during_an_evaluation(monkeypatch):
     before = signal.getsignal(signal.SIGINT)
     result = train(options(eval_freq=100))
     assert result.interrupted and result.evaluation == [] and result.steps == 100
-    assert result.run.model.exists() and result.run.plot.exists()
+    assert result.run.model.exists() and (result.run.path / "training.png").exists()
     assert not (result.run.path / "evaluations.npz").exists()
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -291,24 +291,17 @@ def open_run(folder: Path) -> Run:
     )
 
 
-def find_runs(folder: Path, algos: Iterable[str], envs: Iterable[str]) -> list[Run]:
+def find_runs(folder: Path) -> list[Run]:
     """
-    Find runs in ``<folder>/<algo>/<env>_<k>/``.
-
-    :param folder: where runs are kept
-    :param algos: names of algorithms; none: all
-    :param envs: names of environments, as they appear in those of folders; none: all
-    :return: the runs, by algorithm in the order given, environment and number; those of a study have its variants' names
+    :param folder: where runs are kept, in ``<folder>/<algo>/<env>_<k>/``
+    :return: the runs, by algorithm, environment and number; those of a study have its variants' names
     """
-    algos, envs = list(algos), list(envs)
     found = []
     for path in folder.glob("*/*_*"):
         name, _, number = path.name.rpartition("_")
-        algo = path.parent.name
-        if number.isdecimal() and (not algos or algo in algos) and (not envs or name in envs):
-            if _monitor_files(path) or any(path.glob("*/config.yml")):
-                found.append(((algos.index(algo) if algos else 0, algo, name, int(number)), path))
-    return [replace(open_run(path), algo=path.parent.name) for _, path in sorted(found)]
+        if number.isdecimal() and (_monitor_files(path) or any(path.glob("*/config.yml"))):
+            found.append((path.parent.name, name, int(number), path))
+    return [replace(open_run(path), algo=algo) for algo, _, _, path in sorted(found)]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

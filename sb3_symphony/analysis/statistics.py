@@ -7,12 +7,11 @@ Statistical Precipice", NeurIPS 2021, https://arxiv.org/abs/2108.13264).
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sb3_symphony.analysis.runs import read_episodes, read_evaluations
+from sb3_symphony.analysis.runs import Run
 
 #: numbers drawn at once, 32 MB
 _CHUNK = 4_000_000
@@ -88,16 +87,12 @@ class Summary:
     :param mean: mean
     :param std: standard deviation of the sample as it is (divided by n), as Stable-Baselines3 reports it
     :param iqm: interquartile mean
-    :param low: lower limit of the 95 % confidence interval of ``iqm``
-    :param high: upper limit
     """
 
     n: int
     mean: float
     std: float
     iqm: float
-    low: float
-    high: float
 
 
 def summarise(values: ArrayLike) -> Summary:
@@ -106,8 +101,7 @@ def summarise(values: ArrayLike) -> Summary:
     :return: its statistics
     """
     sample = np.asarray(values, dtype=np.float64)
-    low, high = bootstrap_interval([sample])
-    return Summary(len(sample), float(sample.mean()), float(sample.std()), float(iqm(sample)), float(low), float(high))
+    return Summary(len(sample), float(sample.mean()), float(sample.std()), float(iqm(sample)))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -252,24 +246,22 @@ class RunEvents:
     best_episode: float
 
 
-def run_events(run: Path, threshold: float = 300.0, unstable_below: float = 200.0) -> RunEvents:
+def run_events(run: Run, threshold: float, unstable_below: float) -> RunEvents:
     """
-    :param run: run folder, with ``*.monitor.csv`` and, if there were evaluations, ``evaluations.npz``
+    :param run: a run; one without evaluations or episodes has reached nothing
     :param threshold: return that counts as success
     :param unstable_below: return below which a later evaluation episode counts as a failure
     :return: what the run reached; returns are those of the environment, warm-up episodes count
     """
-    episodes, evaluations = read_episodes(run), read_evaluations(run)
-    steps, returns = (episodes.steps, episodes.returns) if episodes else (np.empty(0, dtype=np.int64), np.empty(0))
-    timesteps, results = np.empty(0, dtype=np.int64), np.empty((0, 1))
-    if evaluations:
-        timesteps, results = evaluations.steps, evaluations.returns
-    stable = first_stable_evaluation(timesteps, results, threshold)
-    failed, counted = unstable_episodes(timesteps, results, stable, unstable_below)
+    nothing = np.empty(0, dtype=np.int64)
+    ends, returns = (run.episodes.steps, run.episodes.returns) if run.episodes else (nothing, np.empty(0))
+    steps, results = (run.evaluations.steps, run.evaluations.returns) if run.evaluations else (nothing, np.empty((0, 1)))
+    stable = first_stable_evaluation(steps, results, threshold)
+    failed, counted = unstable_episodes(steps, results, stable, unstable_below)
     return RunEvents(
         stable=stable,
-        episode=first_episode(steps, returns, threshold),
-        trailing=first_episode(steps, returns, threshold, window=100),
+        episode=first_episode(ends, returns, threshold),
+        trailing=first_episode(ends, returns, threshold, window=100),
         unstable=failed,
         unstable_of=counted,
         best_evaluation=float(results.mean(axis=1).max()) if len(results) else float("nan"),

@@ -18,7 +18,16 @@ from typing import Any
 import numpy as np
 
 from sb3_symphony.analysis.runs import Run, Scalar, told_apart
-from sb3_symphony.analysis.statistics import Event, RunEvents, iqm, iqm_event, median_event, run_events, summarise
+from sb3_symphony.analysis.statistics import (
+    Event,
+    RunEvents,
+    bootstrap_interval,
+    iqm,
+    iqm_event,
+    median_event,
+    run_events,
+    summarise,
+)
 
 #: environment seed of the first evaluation episode
 _EVALUATION_SEED = 10_000
@@ -65,7 +74,7 @@ class Result:
         """What the run reached; without a threshold only its maxima mean something."""
         assert self.run is not None
         solved, below = self.thresholds.solved, self.thresholds.unstable_below
-        return run_events(self.run.path, math.inf if solved is None else solved, -math.inf if below is None else below)
+        return run_events(self.run, math.inf if solved is None else solved, -math.inf if below is None else below)
 
     @property
     def standard(self) -> bool:
@@ -270,8 +279,8 @@ def _final_iqm(runs: Sequence[Result]) -> str:
     means = [each.final.mean() for each in runs if len(each.final)]
     if not means:
         return _NOTHING
-    summary = summarise(means)
-    return f"{summary.iqm:.1f} ({summary.low:.1f} … {summary.high:.1f})" if len(means) > 1 else f"{summary.iqm:.1f}"
+    low, high = bootstrap_interval([means])
+    return f"{iqm(means):.1f} ({low:.1f} … {high:.1f})" if len(means) > 1 else f"{iqm(means):.1f}"
 
 
 def _final_episodes(runs: Sequence[Result]) -> str:

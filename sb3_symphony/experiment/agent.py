@@ -123,7 +123,7 @@ def open_agent(
     try:
         model = load_model(selection, options.device)
         env = BaseAlgorithm._wrap_env(env, verbose=0)  # images with their channels first, as in training
-        check_match(model, env, selection)
+        check_match(model, env, str(selection.model), selection.env_id)
     except BaseException:
         env.close()
         raise
@@ -264,17 +264,7 @@ def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None
         print(f"note: {statistics} lies beside the model, --vecnormalize would use it", file=sys.stderr)
 
 
-def check_match(model: BaseAlgorithm, env: VecEnv, selection: Selection) -> None:
-    """
-    :param model: a trained model
-    :param env: environment that it is to act in
-    :param selection: where both come from
-    :raises ConfigError: if their spaces differ
-    """
-    check_spaces(model, env, str(selection.model), selection.env_id)
-
-
-def check_spaces(model: BaseAlgorithm, env: VecEnv, name: str, env_id: str) -> None:
+def check_match(model: BaseAlgorithm, env: VecEnv, name: str, env_id: str) -> None:
     """
     Limits of observations are not compared: they differ between versions of an environment, and nothing uses them.
 

@@ -31,6 +31,7 @@ from urllib.parse import quote
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError, TrainOptions
 from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.signals import ended_by
 
 #: seconds without a sign of life after which a cell stops by itself
 PATIENCE = 120.0
@@ -163,8 +164,7 @@ def _execute(job: Job) -> int:
 
 def _reason(code: int, log: Path) -> str:
     if code < 0:
-        name = signal.Signals(-code).name
-        return f"its process was ended by {name}" + " (out of memory?)" * (name == "SIGKILL")
+        return ended_by(code)
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     return lines[-1] if lines else f"its process ended with code {code}"
 
@@ -320,17 +320,15 @@ def _seconds(run: RunFolder, n_timesteps: int) -> float:
 
 
 def _machine() -> dict[str, Any]:
-    from importlib.metadata import version
-
     import torch as th
 
-    packages = ("sb3-symphony", "torch", "numpy", "stable_baselines3", "gymnasium")
+    from sb3_symphony.experiment.backends import versions
+
     return {
         "host": socket.gethostname(),
         "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
         "cores": os.cpu_count(),
-        "Python": platform.python_version(),
-        **{package: version(package) for package in packages},
+        **versions(),
     }
 
 

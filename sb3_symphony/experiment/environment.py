@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor, ResultsWriter
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     SubprocVecEnv,
@@ -29,7 +30,7 @@ from stable_baselines3.common.vec_env import (
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.recording import RecordedEpisode
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
-from sb3_symphony.experiment.config import ConfigError, RunSettings, reason
+from sb3_symphony.experiment.config import ConfigError, RunSettings, reason, told
 from sb3_symphony.experiment.decode import typed_arguments
 from sb3_symphony.experiment.registry import without_module
 
@@ -49,7 +50,6 @@ _OWN_KEYS = {
 #: change the reward and nothing else: reported returns stay the environment's own
 REWARD_WRAPPERS = (LearningReward, gym.RewardWrapper)
 _TRAINING_ONLY = (*REWARD_WRAPPERS, EpisodeStepLimit)
-_ON_POLICY = ("ppo", "trpo")
 _ON_POLICY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 Wrappers = list[Callable[[gym.Env], gym.Env]]
@@ -186,7 +186,7 @@ def import_packages(names: list[str]) -> None:
         try:
             import_module(name)
         except Exception as error:  # whatever the module does
-            raise ConfigError(f"--gym-packages: '{name}' cannot be imported — {type(error).__name__}: {error}") from error
+            raise ConfigError(f"--gym-packages: '{name}' cannot be imported — {told(error)}") from error
 
 
 def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym.Env:
@@ -218,7 +218,7 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
     except (TypeError, ValueError, AssertionError, OSError) as error:
         raise ConfigError(f"environment '{env_id}' cannot be made with {env_kwargs} — {error}") from None
     except Exception as error:  # whatever a user's own module or environment does
-        raise ConfigError(f"environment '{env_id}' cannot be made — {type(error).__name__}: {error}") from error
+        raise ConfigError(f"environment '{env_id}' cannot be made — {told(error)}") from error
     registered = env.spec.id if env.spec is not None else env_id
     if registered != without_module(env_id):  # Gymnasium takes the latest version; settings and folders go by the full id
         env.close()
@@ -228,23 +228,24 @@ def make_env(env_id: str, env_kwargs: dict[str, Any], wrappers: Wrappers) -> gym
     return _wrapped(env, wrappers)
 
 
-def check_spaces(env: VecEnv, env_id: str, algo: str, policy: str) -> None:
+def check_spaces(env: VecEnv, env_id: str, algo: str, algorithm: type[BaseAlgorithm], policy: str) -> None:
     """
     :param env: the environment
     :param env_id: its id
     :param algo: name of the algorithm
+    :param algorithm: its class
     :param policy: name of the policy
     :raises ConfigError: if algorithm or policy do not fit its spaces
     """
-    space = env.action_space
-    allowed = _ON_POLICY_SPACES if algo in _ON_POLICY else (spaces.Box,)
+    space, on_policy = env.action_space, issubclass(algorithm, OnPolicyAlgorithm)
+    allowed = _ON_POLICY_SPACES if on_policy else (spaces.Box,)
     if not isinstance(space, allowed):
         raise ConfigError(f"{env_id}: its action space is {space} — {algo} needs a continuous one (Box)")
     if isinstance(space, spaces.Box) and not np.all(np.isfinite([space.low, space.high])):
         raise ConfigError(f"{env_id}: its action space {space} is unbounded — {algo} needs finite limits")
-    if algo not in _ON_POLICY and isinstance(env, VecFrameStack) and unwrap_vec_normalize(env) is not None:
+    if not on_policy and isinstance(env, VecFrameStack) and unwrap_vec_normalize(env) is not None:
         # The replay keeps what VecNormalize was given, one observation at a time
-        raise ConfigError(f"frame_stack: cannot be combined with normalize for {algo} — only for {', '.join(_ON_POLICY)}")
+        raise ConfigError(f"frame_stack: cannot be combined with normalize for {algo} — only for on-policy algorithms")
     if policy == "MultiInputPolicy" and not isinstance(env.observation_space, spaces.Dict):
         raise ConfigError(f"policy: 'MultiInputPolicy' — needs Dict observations, {env_id} has {env.observation_space}")
 

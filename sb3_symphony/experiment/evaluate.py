@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_symphony.analysis.statistics import summarise
+from sb3_symphony.analysis.statistics import bootstrap_interval, summarise
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.environment import Wrappers
-from sb3_symphony.experiment.output import progress_bar, report
+from sb3_symphony.experiment.output import json_report, progress_bar
 from sb3_symphony.experiment.robustness import ActionDelay, ObservationNoise
 from sb3_symphony.experiment.select import EvaluateOptions, Selection
 from sb3_symphony.experiment.signals import end_with_parent
@@ -51,13 +51,14 @@ class Evaluation:
 
     def as_dict(self) -> dict[str, Any]:
         """:return: statistics, returns, lengths and circumstances, as plain values"""
-        summary = summarise([episode.reward for episode in self.episodes])
+        returns = [episode.reward for episode in self.episodes]
+        summary = summarise(returns)
         successes = [episode.success for episode in self.episodes if episode.success is not None]
         return {
             "mean_reward": summary.mean,
             "std_reward": summary.std,
             "iqm": summary.iqm,
-            "iqm_ci95": [summary.low, summary.high],
+            "iqm_ci95": [float(limit) for limit in bootstrap_interval([returns])],
             "mean_length": float(np.mean([episode.length for episode in self.episodes])),
             "episodes": len(self.episodes),
             **({"success_rate": float(np.mean(successes))} if successes else {}),
@@ -68,7 +69,7 @@ class Evaluation:
             "deterministic": self.options.deterministic,
             "obs_noise": self.options.obs_noise,
             "action_delay": self.options.action_delay,
-            "returns": [episode.reward for episode in self.episodes],
+            "returns": returns,
             "lengths": [episode.length for episode in self.episodes],
         }
 
@@ -103,7 +104,8 @@ def evaluate(options: EvaluateOptions) -> Evaluation:
     :raises ConfigError: if something is missing or damaged, does not fit, or cannot be written
     """
     # Opened here too with several processes: mistakes are found before they start
-    with report(options.json_file) as tell, _open(options) as agent:
+    tell = json_report(options.json_file)
+    with _open(options) as agent:
         seeds = range(options.seed, options.seed + options.n_episodes)
         played = _in_processes(options, seeds) if min(options.n_envs, len(seeds)) > 1 else _in_turn(agent, options, seeds)
         episodes = list(progress_bar(played, "episodes", options.progress, len(seeds)))

@@ -12,7 +12,7 @@ import numpy as np
 from sb3_symphony.analysis.gait import GaitNumbers, Recording, gait_numbers, plot_gait
 from sb3_symphony.analysis.style import SUFFIXES
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file, progress_bar, report
+from sb3_symphony.experiment.output import json_report, output_file, progress_bar
 from sb3_symphony.experiment.select import GaitOptions
 from sb3_symphony.experiment.video import Camera, Shown, show_agents
 
@@ -81,9 +81,8 @@ class Gait:
     :param seed: seed of the episode
     :param reward: return of the episode
     :param length: number of steps of the episode
-    :param whole: the episode without its beginning
     :param shown: the part of it that the figure shows
-    :param numbers: of ``whole``
+    :param numbers: of the episode without its beginning
     """
 
     label: str
@@ -91,20 +90,13 @@ class Gait:
     seed: int
     reward: float
     length: int
-    whole: Recording
     shown: Recording
     numbers: GaitNumbers
 
     def plain(self) -> dict[str, Any]:
-        """:return: everything but the recordings, as JSON takes it; what is not known is None"""
+        """:return: everything but the recordings, plain values; what is not known is NaN"""
         facts = {name: getattr(self, name) for name in ("label", "model", "seed", "reward", "length")}
-        return _none_for_nan({**facts, **asdict(self.numbers)})
-
-
-def _none_for_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _none_for_nan(item) for key, item in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value
+        return {**facts, **asdict(self.numbers)}
 
 
 def record_gait(shown: Shown, options: GaitOptions) -> Gait:
@@ -154,7 +146,7 @@ def record_gait(shown: Shown, options: GaitOptions) -> Gait:
 
     whole, seen = part(skip, length), part(skip, min(skip + n_shown, length))
     model = str(shown.agent.selection.model)
-    return Gait(shown.label, model, options.seed, reward, length, whole, seen, gait_numbers(whole))
+    return Gait(shown.label, model, options.seed, reward, length, seen, gait_numbers(whole))
 
 
 def _table(gaits: Sequence[Gait]) -> str:
@@ -200,7 +192,8 @@ def gait(options: GaitOptions) -> list[Gait]:
     :return: how each of them walked; numbers are printed, and the figure is written
     :raises ConfigError: if an agent cannot be opened, is no walker, falls at once, or a file cannot be written
     """
-    with report(options.json_file) as tell, ExitStack() as cleanup:
+    tell = json_report(options.json_file)
+    with ExitStack() as cleanup:
         agents = show_agents(options, cleanup, WalkerSensors)
         selection = agents[0].agent.selection
         run = None if selection.shipped else selection.run

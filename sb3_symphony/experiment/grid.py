@@ -11,12 +11,11 @@ Results lie in one folder, which holds all that is needed to go on or to make th
     <folder>/cells.csv, episodes.csv, matrix.csv, table.md, evaluations.png, training.png, matrix.png, …
 """
 
-import os
 import shutil
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
@@ -155,7 +154,7 @@ def _check_models(progress: Sequence[Progress]) -> None:
         env.close()
         return model
 
-    for each in {(p.cell.algorithm, p.cell.environment.id): p for p in progress if not p.kept}.values():
+    for each in {(p.cell.algorithm, p.cell.environment.id): p for p in progress}.values():
         cell = each.cell
         try:
             model = model_of(cell, each.config)
@@ -189,7 +188,7 @@ def _check_searches(study: Study, progress: Sequence[Progress], path: Path, fold
 
 
 def _check_condition(name: str, condition: dict[str, Any], cell: Cell, config: RunConfig, model: "BaseAlgorithm") -> None:
-    from sb3_symphony.experiment.agent import check_spaces
+    from sb3_symphony.experiment.agent import check_match
     from sb3_symphony.experiment.environment import check_task_wrappers, make_evaluation_env
 
     settings = config.settings.varied(condition["env_kwargs"], condition["env_wrapper"])
@@ -197,7 +196,7 @@ def _check_condition(name: str, condition: dict[str, Any], cell: Cell, config: R
         check_task_wrappers(condition["env_wrapper"], "env_wrapper")
         env = make_evaluation_env(cell.environment.id, settings)
         env.close()
-        check_spaces(model, env, "the model", cell.environment.id)
+        check_match(model, env, "the model", cell.environment.id)
     except ConfigError as error:
         raise ConfigError(f"condition '{name}': {error}") from None
 
@@ -251,23 +250,13 @@ def _job(progress: Progress, folder: Path, session: Path, tensorboard: bool) -> 
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    from filelock import FileLock, Timeout
-
-    try:
-        with FileLock(folder / ".lock", timeout=0):
-            yield
-    except Timeout:
-        raise ConfigError(f"-f: '{folder}' is being worked on by another process") from None
-
-
 def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: Path, path: Path) -> BenchResult:
     from sb3_symphony.experiment.backends import open_backend
-    from sb3_symphony.experiment.output import full_disk_told, output_folder
+    from sb3_symphony.experiment.output import alone, full_disk_told, output_folder
 
     left = [each for each in progress if not each.kept]
     interrupted = False
+    in_use = f"-f: '{folder}' is being worked on by another process"
     if left:
         print(f"{len(left)} of {len(progress)} cells to do, into {folder}", flush=True)
         _check_models(left)
@@ -276,7 +265,7 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
         backend = open_backend(options.backend, options.n_jobs, options.address, gpus)
         try:
             new = not folder.exists()
-            with _alone(output_folder(folder, "-f")), full_disk_told([folder], "the same command goes on"):
+            with alone(output_folder(folder, "-f"), in_use), full_disk_told([folder], "the same command goes on"):
                 session = _new_session(backend, folder, new)
                 _write_settings(progress, folder, path)
                 interrupted = _run_ready(study, progress, folder, session, backend)
@@ -322,9 +311,11 @@ def _search(study: Study, progress: Sequence[Progress], options: BenchOptions, p
 
     :return: whether that was stopped by a signal
     """
+    import joblib
+
     from sb3_symphony.experiment.tune import tune
 
-    cores = options.n_jobs or os.cpu_count() or 1
+    cores = options.n_jobs or joblib.cpu_count()
     for name, sweep in _searches(study, progress, path, folder):
         n_jobs = max(1, cores // sweep.seeds_per_trial)
         result = tune(sweep.model_copy(update={"n_jobs": n_jobs}))

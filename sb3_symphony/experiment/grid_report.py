@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.cell import read_result
 from sb3_symphony.experiment.config import ConfigError, read_yaml
 from sb3_symphony.experiment.grid_progress import Progress
+from sb3_symphony.experiment.plot import NothingToDraw, PlotOptions, plot
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.study import Drawing, Environment, Study, sweep_options
 
@@ -46,11 +47,11 @@ def collect(study: Study, progress: Sequence[Progress], folder: Path, target: Pa
     recorded = [read_yaml(path).get("log_folder", "") for path in found if path.name == "args.yml"]
     # The results may have been moved since. Longest first, as one may be the beginning of another
     folders = sorted({str(folder), *filter(os.path.isabs, recorded)}, key=len, reverse=True)
+    named = re.compile(rf"""(?:{"|".join(map(re.escape, folders))})(/|(?=[\s'",]|$))""".encode())
     contents = {path: path.read_bytes() for path in found}
     for path in found:
         if path.suffix in (".yml", ".json"):
-            for name in folders:
-                contents[path] = contents[path].replace(f"{name}/".encode(), b"").replace(name.encode(), b".")
+            contents[path] = named.sub(lambda found: b"" if found[1] else b".", contents[path])
     for each in progress:
         if scalars := _drawn_scalars(study, each):
             contents[each.run.path / "scalars.csv"] = scalar_table(scalars).encode()
@@ -183,35 +184,14 @@ def _thresholds(environment: Environment) -> Any:
 
 def _draw(by_environment: Sequence[Sequence["Result"]], folder: Path) -> None:
     """Learning curves of the runs that the tables tell of."""
-    from sb3_symphony.analysis.plots import episode_curve, evaluation_curve, plot_curves, summarised
-    from sb3_symphony.analysis.runs import NotRecorded, Run
     from sb3_symphony.analysis.tables import by_algorithm, told_of
 
-    def line(kind: str, run: Run) -> Any:
-        return evaluation_curve(run, "steps", "reward") if kind == "evaluations" else episode_curve(run, "steps", "reward", 20)
-
-    def lines(kind: str, row: Sequence["Result"]) -> Iterator[Any]:
-        for each in told_of(row):
-            assert each.run is not None
-            try:
-                x, y = line(kind, each.run)
-            except NotRecorded:
-                continue
-            if len(x):
-                yield x, y
-
-    notes = {"evaluations": "mean of each evaluation's episodes", "training": "running mean of 20 training episodes"}
-    for kind, smoothed in notes.items():
-        panels: dict[str, list[Any]] = {}
-        for results in by_environment:
-            rows = {name: list(lines(kind, row)) for name, row in by_algorithm(results).items()}
-            if curves := [summarised(name, seeds) for name, seeds in rows.items() if seeds]:
-                panels[results[0].environment] = curves
-        output = folder / f"{kind}.png"
-        if panels:
-            plot_curves(panels, "steps", "reward", smoothed, output)
-        else:
-            output.unlink(missing_ok=True)
+    told = [each for results in by_environment for row in by_algorithm(results).values() for each in told_of(row)]
+    for kind, figure in {"evaluations": PlotOptions(evaluations=True), "training": PlotOptions(episode_window=20)}.items():
+        try:
+            _draw_curves(figure, told, folder / f"{kind}.png")
+        except NothingToDraw:
+            (folder / f"{kind}.png").unlink(missing_ok=True)
 
 
 def _draw_figures(study: Study, results: Sequence["Result"], folder: Path) -> None:
@@ -226,9 +206,8 @@ def _draw_figures(study: Study, results: Sequence["Result"], folder: Path) -> No
             print(f"{name}.png is not drawn: {error}", flush=True)
 
 
-def _draw_curves(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
+def _draw_curves(figure: PlotOptions, results: Sequence["Result"], output: Path) -> None:
     from sb3_symphony.analysis.runs import Group
-    from sb3_symphony.experiment.plot import plot
 
     groups: dict[tuple[str, str], Group] = {}
     for each in results:

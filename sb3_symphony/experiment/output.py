@@ -83,8 +83,7 @@ def check_folder(name: str | Path, flag: str) -> None:
         return
 
 
-@contextmanager
-def report(name: str | None) -> Iterator[Callable[[Any], None]]:
+def json_report(name: str | None) -> Callable[[Any], None]:
     """
     For a command with ``--json``: looks whether the file could be written before the work begins.
 
@@ -105,7 +104,7 @@ def report(name: str | None) -> Iterator[Callable[[Any], None]]:
                 print(text)  # what has taken minutes is not lost with it
                 raise
 
-    yield tell
+    return tell
 
 
 def _with_null(values: Any) -> Any:
@@ -149,6 +148,24 @@ def write_output(path: Path, content: bytes, flag: str) -> None:
         write_atomically(path, content)
     except OSError as error:
         raise ConfigError(f"{flag}: '{path}' cannot be written — {error.strerror}") from None
+
+
+@contextmanager
+def alone(folder: Path, message: str) -> Iterator[None]:
+    """
+    No other process is inside such a block meanwhile; the system releases the lock of one that was killed.
+
+    :param folder: where the lock is
+    :param message: what to say if another one is
+    :raises ConfigError: if another one is
+    """
+    from filelock import FileLock, Timeout
+
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            yield
+    except Timeout:
+        raise ConfigError(message) from None
 
 
 @contextmanager

@@ -10,13 +10,17 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import output_file, report
+from sb3_symphony.experiment.output import json_report, output_file
 from sb3_symphony.experiment.registry import without_module
 from sb3_symphony.experiment.run_folder import RunFolder
 
 if TYPE_CHECKING:  # the command line imports this module before it knows what is to be done
     from sb3_symphony.analysis.plots import Curve, Line
     from sb3_symphony.analysis.runs import Group, Run
+
+
+class NothingToDraw(ConfigError):
+    """No run has recorded what is asked for."""
 
 
 class PlotOptions(BaseModel):
@@ -58,26 +62,28 @@ def plot(options: PlotOptions, groups: "list[Group] | None" = None) -> Path:
     from sb3_symphony.analysis import plots, style
 
     check_options(options)
-    with report(options.json_file) as tell:
-        try:
-            groups = _groups(options) if groups is None else groups
-            output = Path(options.output or _default_output(options, groups))
-            style.check_suffix(output)
-            output_file(options.output or output, "--output")
-            panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
-        except ValueError as error:
-            raise ConfigError(str(error)) from None
-        except OSError as error:
-            raise ConfigError(f"'{error.filename}' cannot be read — {error.strerror}") from None
-        try:
-            if options.kind == "scalars":
-                title = ", ".join(dict.fromkeys(group.env for group in groups))
-                plots.plot_scalars(panels, options.x_axis, output, title)
-            else:
-                plots.plot_curves(panels, options.x_axis, options.y_axis, _smoothed(options), output)
-        except OSError as error:
-            raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror}") from None
-        tell({"x": options.x_axis, "panels": {title: [curve.plain() for curve in panel] for title, panel in panels.items()}})
+    tell = json_report(options.json_file)
+    try:
+        groups = _groups(options) if groups is None else groups
+        output = Path(options.output or _default_output(options, groups))
+        style.check_suffix(output)
+        output_file(options.output or output, "--output")
+        panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    except OSError as error:
+        raise ConfigError(f"'{error.filename}' cannot be read — {error.strerror}") from None
+    try:
+        if options.kind == "scalars":
+            title = ", ".join(dict.fromkeys(group.env for group in groups))
+            plots.plot_scalars(panels, options.x_axis, output, title)
+        else:
+            plots.plot_curves(panels, options.x_axis, options.y_axis, _smoothed(options), output)
+    except OSError as error:
+        raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror}") from None
+    tell({"x": options.x_axis, "panels": {title: [curve.plain() for curve in panel] for title, panel in panels.items()}})
     return output
 
 
@@ -109,17 +115,15 @@ def _groups(options: PlotOptions) -> "list[Group]":
         folders = {Path(folder).resolve(): Path(folder) for folder in options.runs}  # each once
         runs = [open_run(folder) for folder in folders.values()]
     else:
-        folder = Path(options.folder)
-        runs = find_runs(folder, options.algo, map(RunFolder.file_name, options.env))
-        envs = [without_module(env) for env in options.env]
-        for flag, wanted, there in (
-            ("-a", options.algo, {run.algo for run in find_runs(folder, [], [])}),
-            ("-e", envs, {run.env for run in find_runs(folder, options.algo, [])}),
-        ):
+        everything = find_runs(Path(options.folder))
+        algos, envs = options.algo, [without_module(env) for env in options.env]
+        runs = [run for name in algos for run in everything if run.algo == name] if algos else everything
+        for flag, wanted, there in (("-a", algos, {run.algo for run in everything}), ("-e", envs, {run.env for run in runs})):
             for name in wanted:
                 if name not in there:
                     known = suggestion(name, there) or (f" — there are runs of {', '.join(sorted(there))}" if there else "")
                     raise ConfigError(f"{flag}: '{name}' — no such run in {options.folder}{known}")
+        runs = [run for run in runs if not envs or run.env in envs]
         if not runs:
             raise ConfigError(f"no runs in '{options.folder}' — expected <algo>/<env>_<k>/ there; `train` makes them")
     groups = group_runs(runs)
@@ -160,7 +164,7 @@ def _lines(options: PlotOptions, runs: "Iterable[Run]", line: "Callable[[Run], L
 
 def _told(panels: "dict[str, list[Curve]]", left_out: list[str]) -> "dict[str, list[Curve]]":
     if not panels:
-        raise ConfigError(left_out[0])
+        raise NothingToDraw(next(iter(left_out), "no run has come anywhere yet"))
     for message in dict.fromkeys(left_out):
         print(f"left out: {message}", file=sys.stderr)
     return panels

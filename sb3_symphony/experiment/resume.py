@@ -20,7 +20,7 @@ from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions,
 from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
-#: options that may differ from those the run was started with; nothing that is learned depends on them
+#: options that may differ from those the run was started with. Only schedules depend on any of them, on the first
 _CHANGEABLE = {"n_timesteps", "save_freq", "keep", "verbose", "progress", "quiet", "json_file"}
 
 

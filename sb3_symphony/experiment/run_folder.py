@@ -116,11 +116,6 @@ class RunFolder:
         """File that says where the TensorBoard log is."""
         return self.details / "tensorboard.txt"
 
-    @property
-    def plot(self) -> Path:
-        """Curve of returns."""
-        return self.path / "training.png"
-
     def write_configuration(self, options: dict[str, Any], config: dict[str, Any], command: str) -> None:
         """
         Write what the run was started with, as plain YAML.

@@ -46,6 +46,15 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
+def ended_by(code: int) -> str:
+    """
+    :param code: exit code of a process that a signal has ended
+    :return: what it ended by, in words
+    """
+    name = signal.Signals(-code).name
+    return f"its process was ended by {name}" + " (out of memory?)" * (name == "SIGKILL")
+
+
 def _without_terminal(handler: Handler) -> Handler:
     """The same once nothing goes to the terminal any more: to write there would be an error."""
 

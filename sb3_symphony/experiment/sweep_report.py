@@ -15,9 +15,9 @@ import optuna
 import yaml
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_symphony.analysis.tables import aligned
+from sb3_symphony.analysis.tables import aligned, as_csv
 from sb3_symphony.common.files import write_atomically
-from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge
+from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge, told
 from sb3_symphony.experiment.space import parse_space
 from sb3_symphony.experiment.sweep_storage import WORKER
 
@@ -131,11 +131,7 @@ class SweepReport:
             write_atomically(self.folder / "plan.json", json.dumps(self.plan, indent=1).encode())
             rows = self.rows()
             if rows:
-                table = io.StringIO()
-                writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(rows)
-                write_atomically(self.folder / "trials.csv", table.getvalue().encode())
+                write_atomically(self.folder / "trials.csv", as_csv(rows[0], rows).encode())
             best = best_of(self.study.get_trials(deepcopy=False))
             if best is not None:
                 write_atomically(self.folder / "best.yml", self._best_yaml(best).encode())
@@ -180,7 +176,7 @@ class SweepReport:
         """:return: state, best trials and where the files are, for the terminal"""
         trials = self.study.get_trials(deepcopy=False)
         again = replaced(trials)
-        states = _told([trial.state.name.lower() for trial in trials]) or "none"
+        states = _counted([trial.state.name.lower() for trial in trials]) or "none"
         lines = [f"{self.study.study_name}: {len(trials)} trials ({states}; {len(again)} of them tried again)"]
         lines[0] = lines[0] if again else lines[0].replace("; 0 of them tried again", "")
         reasons = Counter(reason_of(trial) for trial in trials if trial.state == TrialState.FAIL)
@@ -224,13 +220,13 @@ def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
         again = {row["retry_of"] for row in rows}
         rows = [row for row in rows if row["number"] not in again]
         states = [row["state"] for row in rows]
-        told = _told(states)
+        counted = _counted(states)
         hours = sum(float(row["seconds"] or 0) for row in rows) / 3600
         completed = [(-float(row["value"]), int(row["number"]), row) for row in rows if row["state"] == "complete"]
     except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
-        raise ConfigError(f"'{path}': no table of trials — {type(error).__name__}: {error}") from None
+        raise ConfigError(f"'{path}': no table of trials — {told(error)}") from None
     ended = sum(state in ("complete", "pruned", "fail") for state in states)
-    summary = f"{ended} of {n_trials} trials ({told}), {hours:.1f} hours one after the other."
+    summary = f"{ended} of {n_trials} trials ({counted}), {hours:.1f} hours one after the other."
     if not completed:
         return f"{heading}{summary}\n"
     names = [column for column in rows[0] if not _ABOUT.fullmatch(column) and len({row[column] for row in rows}) > 1]
@@ -240,7 +236,7 @@ def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
     return "\n".join([f"{heading}{summary} The best:", "", *aligned(table), ""])
 
 
-def _told(states: list[str]) -> str:
+def _counted(states: list[str]) -> str:
     """How many trials are in which state, in words."""
     counts = Counter(_STATES[state] for state in states)
     return ", ".join(f"{counts[word]} {word}" for word in _STATES.values() if counts[word])

@@ -4,14 +4,13 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
-from filelock import FileLock, Timeout
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -41,7 +40,7 @@ from sb3_symphony.experiment.environment import (
     make_evaluation_env,
     make_training_env,
 )
-from sb3_symphony.experiment.output import check_folder, full_disk_told
+from sb3_symphony.experiment.output import alone, check_folder, full_disk_told
 from sb3_symphony.experiment.protocol import keep_protocol, solved_stride
 from sb3_symphony.experiment.registry import load_algorithm
 from sb3_symphony.experiment.resume import continue_logs, open_run, restore_files
@@ -130,7 +129,7 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
         recorded=options.save_freq > 0,
     )
     try:
-        check_spaces(env, options.env, options.algo, config.settings.policy)
+        check_spaces(env, options.env, options.algo, algorithm, config.settings.policy)
         arguments = algorithm_arguments(options.algo, algorithm, config, env.action_space)
         _check_goals(env, options.env, arguments.get("replay_buffer_class"))
         if options.tensorboard_log:
@@ -151,35 +150,8 @@ def _check_goals(env: VecEnv, env_id: str, replay_buffer_class: type | None) -> 
         raise ConfigError(f"replay_buffer_class: 'HerReplayBuffer' — needs observations with goals, {env_id} has {space}")
 
 
-def _evaluation(
-    options: TrainOptions, config: RunConfig, run: RunFolder, env: VecEnv, stop: StopOnSignal, verbose: int
-) -> SeededEvaluation:
-    return SeededEvaluation(
-        env,
-        stop,
-        options.threshold,
-        solved_stride(options),
-        stop_reward=config.settings.stop_reward,
-        callback_on_new_best=SaveBestModel(run.best_model, run.best_normalization),
-        n_eval_episodes=options.eval_episodes,
-        eval_freq=max(options.eval_freq // config.settings.n_envs, 1),
-        log_path=run.path,
-        verbose=verbose,
-    )
-
-
-def _saved_models(options: TrainOptions, config: RunConfig, run: RunFolder) -> SavedModels:
-    return SavedModels(max(options.save_freq // config.settings.n_envs, 1), str(run.path))
-
-
-@contextmanager
-def _alone(run: RunFolder) -> Iterator[None]:
-    """No other process trains this run meanwhile; the system releases the lock of one that was killed."""
-    try:
-        with FileLock(run.checkpoints / ".lock", timeout=0):
-            yield
-    except Timeout:
-        raise ConfigError(f"--resume: '{run.path}' is being trained by another process") from None
+def _alone(run: RunFolder) -> AbstractContextManager[None]:
+    return alone(run.checkpoints, f"--resume: '{run.path}' is being trained by another process")
 
 
 def _resuming(checkpoint: Checkpoint | None, model: BaseAlgorithm) -> str:
@@ -198,10 +170,23 @@ def _callbacks(
 ) -> tuple[StopOnSignal, SeededEvaluation | None, list[BaseCallback]]:
     """One that stops, one that evaluates if there is an environment for it, and all whose counts belong to the run."""
     stop = StopOnSignal(at_rollouts=options.save_freq > 0)
-    evaluation = None if evaluation_env is None else _evaluation(options, config, run, evaluation_env, stop, verbose)
+    n_envs, evaluation = config.settings.n_envs, None
+    if evaluation_env is not None:
+        evaluation = SeededEvaluation(
+            evaluation_env,
+            stop,
+            options.threshold,
+            solved_stride(options),
+            stop_reward=config.settings.stop_reward,
+            callback_on_new_best=SaveBestModel(run.best_model, run.best_normalization),
+            n_eval_episodes=options.eval_episodes,
+            eval_freq=max(options.eval_freq // n_envs, 1),
+            log_path=run.path,
+            verbose=verbose,
+        )
     counting: list[BaseCallback] = [evaluation] if evaluation else []
     if options.save_freq > 0:
-        counting.append(_saved_models(options, config, run))
+        counting.append(SavedModels(max(options.save_freq // n_envs, 1), str(run.path)))
     return stop, evaluation, counting
 
 

@@ -17,8 +17,8 @@ from sb3_symphony.common.averaging import AveragedActor
 from sb3_symphony.common.checkpoint import newest_checkpoint
 from sb3_symphony.common.files import DamagedFile
 from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
-from sb3_symphony.experiment.agent import check_match, check_spaces, load_model, load_normalization
-from sb3_symphony.experiment.config import ConfigError, TrainOptions, of_networks, read_yaml
+from sb3_symphony.experiment.agent import check_match, load_model, load_normalization
+from sb3_symphony.experiment.config import ConfigError, TrainOptions, of_networks, read_yaml, told
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import Selection, SelectOptions, select_model
 
@@ -71,7 +71,7 @@ def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: b
         if "--vecnormalize" in str(error):  # a flag of other commands
             raise unknown from None
         raise ConfigError(f"-i: {error}") from None
-    check_match(trained, env, selection)
+    check_match(trained, env, str(selection.model), selection.env_id)
     _take_networks(model, trained, str(selection.model))
     assert model.seed is not None
     set_random_seed(model.seed)  # loading has left the trained one's
@@ -100,7 +100,7 @@ def check_source(model: BaseAlgorithm, source: BaseAlgorithm, name: str, with_re
     assert env is not None and theirs is not None
     if unwrap_vec_normalize(env) is not None and unwrap_vec_normalize(theirs) is None:
         raise ConfigError(f"start_from: {name} has no statistics of VecNormalize — expected normalize for both or for neither")
-    check_spaces(source, env, name, "the environment")
+    check_match(source, env, name, "the environment")
     _take_networks(model, source, name)
     if with_replay_buffer:
         buffer = _replay_buffer_of(model)
@@ -183,5 +183,5 @@ def _experience(selection: Selection) -> tuple[Iterator[dict[str, np.ndarray]], 
             stored = load_from_pkl(pickled)
         assert isinstance(stored, ReplayBuffer), f"a {type(stored).__name__}"
     except Exception as error:  # a pickle can fail in any way
-        raise ConfigError(f"{pickled}: not a replay buffer of SB3, or damaged — {type(error).__name__}: {error}") from error
+        raise ConfigError(f"{pickled}: not a replay buffer of SB3, or damaged — {told(error)}") from error
     return iter([ReplaySegments.of(stored)]), pickled

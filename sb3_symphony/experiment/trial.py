@@ -25,7 +25,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_symphony.experiment.callbacks import SeededEvaluation, StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
 from sb3_symphony.experiment.environment import make_evaluation_env
-from sb3_symphony.experiment.signals import end_with_parent
+from sb3_symphony.experiment.signals import end_with_parent, ended_by
 from sb3_symphony.experiment.train import build_callbacks, build_model
 
 
@@ -236,6 +236,5 @@ class TrialProcesses:
 
 def _ending(exitcode: int | None) -> str:
     if exitcode is not None and exitcode < 0:
-        name = signal.Signals(-exitcode).name
-        return f"its process was ended by {name}" + " (out of memory?)" * (name == "SIGKILL")
+        return ended_by(exitcode)
     return f"its process ended with code {exitcode}"

@@ -20,6 +20,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 import optuna
 from optuna.exceptions import ExperimentalWarning, UpdateFinishedTrialError
@@ -181,8 +182,8 @@ class Sweep:
         self._study_id = storage.optuna.get_study_id_from_name(study.study_name)
         self._pruner = _pruner(self.options)
         n_seeds = len(self.options.seeds)
-        self._n_jobs = self.options.n_jobs if self.options.n_jobs > 0 else max(1, _cores() // n_seeds)
-        threads = self.options.num_threads if self.options.num_threads > 0 else _cores() // (self._n_jobs * n_seeds)
+        self._n_jobs = self.options.n_jobs if self.options.n_jobs > 0 else max(1, joblib.cpu_count() // n_seeds)
+        threads = self.options.num_threads if self.options.num_threads > 0 else joblib.cpu_count() // (self._n_jobs * n_seeds)
         self._training = self.options.training({}).model_copy(update={"num_threads": max(1, threads)})
         self._running: list[_Running] = []
         self._own: set[int] = set()  # ids of the trials that this process has claimed and not ended
@@ -410,10 +411,6 @@ def _words(told: FrozenTrial, attributes: dict[str, Any]) -> str:
         case _:
             end = f"failed: {attributes[REASON]}"
     return f"trial {told.number} {end}"
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _sampler(options: TuneOptions, number: int) -> optuna.samplers.BaseSampler:

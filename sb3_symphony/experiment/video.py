@@ -24,7 +24,7 @@ from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
 from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_symphony.experiment.agent import Agent, open_agent
-from sb3_symphony.experiment.config import ConfigError
+from sb3_symphony.experiment.config import ConfigError, told
 from sb3_symphony.experiment.output import output_file, output_folder, progress_bar
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import AgentsOptions, Selection, SelectOptions, VideoOptions
@@ -53,7 +53,7 @@ class Camera(gym.Wrapper):
         try:
             picture = self.env.render()
         except Exception as error:  # of the graphics library
-            raise ConfigError(f"{name}: cannot be drawn on this machine — {type(error).__name__}: {error}") from error
+            raise ConfigError(f"{name}: cannot be drawn on this machine — {told(error)}") from error
         return np.asarray(picture)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
