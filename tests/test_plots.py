@@ -123,6 +123,13 @@ def test_names_do_not_overlap():
 # ---------------------------------------------------------------- figures
 
 
+def test_names_given_twice(logs, figures):
+    assert main(["plot", "-a", "sac", "sac", "-e", "X-v0", "X-v0"]) == 0
+    (axes,) = figures[0].axes
+    bold, faint = lines(axes)
+    assert len(bold) == 1 and len(faint) == 3
+
+
 def test_training_curves(logs, figures, capsys):
     assert main(["plot", "-a", "sac", "td3", "-e", "X-v0", "-w", "5"]) == 0
     assert capsys.readouterr().out.strip() == "logs/X-v0_episodes.png"

@@ -120,7 +120,7 @@ class Loky:
 _VERSIONS = ("sb3-symphony", "torch", "numpy", "stable_baselines3", "gymnasium")
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """:return: those of Python and the packages that results depend on"""
     return {"Python": platform.python_version(), **{package: version(package) for package in _VERSIONS}}
 
@@ -130,7 +130,7 @@ def _seen(token: str) -> tuple[str, str | None, dict[str, str]]:
     content = None
     with suppress(OSError):
         content = Path(token).read_text(encoding="utf-8")
-    return socket.gethostname(), content, versions()
+    return socket.gethostname(), content, package_versions()
 
 
 #: how HTTP/2, which Ray's servers speak, begins, with settings that change nothing (RFC 9113, 3.4)
@@ -224,7 +224,7 @@ class Ray:
                 raise ConfigError(f"machine {name} cannot run cells — {reason}") from None
             if seen != content:
                 raise ConfigError(f"machine {name} does not see '{folder}' — expected a folder that all machines share (-f)")
-            differing = [f"{k} {v}, here {versions()[k]}" for k, v in versions.items() if v != versions()[k]]
+            differing = [f"{k} {v}, here {package_versions()[k]}" for k, v in versions.items() if v != package_versions()[k]]
             if differing:
                 raise ConfigError(f"machine {name} has {'; '.join(differing)} — expected the same, or results would differ")
 

@@ -322,13 +322,13 @@ def _seconds(run: RunFolder, n_timesteps: int) -> float:
 def _machine() -> dict[str, Any]:
     import torch as th
 
-    from sb3_symphony.experiment.backends import versions
+    from sb3_symphony.experiment.backends import package_versions
 
     return {
         "host": socket.gethostname(),
         "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
         "cores": os.cpu_count(),
-        **versions(),
+        **package_versions(),
     }
 
 

@@ -117,7 +117,7 @@ def _groups(options: PlotOptions) -> "list[Group]":
     else:
         everything = find_runs(Path(options.folder))
         algos, envs = options.algo, [without_module(env) for env in options.env]
-        runs = [run for name in algos for run in everything if run.algo == name] if algos else everything
+        runs = [run for name in dict.fromkeys(algos) for run in everything if run.algo == name] if algos else everything
         for flag, wanted, there in (("-a", algos, {run.algo for run in everything}), ("-e", envs, {run.env for run in runs})):
             for name in wanted:
                 if name not in there:
