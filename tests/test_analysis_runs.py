@@ -19,6 +19,7 @@ from sb3_symphony.analysis.runs import (
     read_scalars,
 )
 from sb3_symphony.analysis.tables import scalar_table
+from sb3_symphony.experiment.plot import PlotOptions, _groups
 
 
 def write_monitor(path, start, rows, columns="r,l,t"):
@@ -175,7 +176,7 @@ def test_no_run(tmp_path):
         open_run(tmp_path)
 
 
-def test_find_runs_in_their_order(tmp_path):
+def test_find_runs_takes_names_exactly(tmp_path):
     for algo, env, number in [
         ("sac", "W-v3", 1),
         ("sac", "W-v3", 10),
@@ -188,6 +189,9 @@ def test_find_runs_in_their_order(tmp_path):
     names = [str(run.path.relative_to(tmp_path)) for run in find_runs(tmp_path)]
     assert names == ["sac/W-v3_1", "sac/W-v3_2", "sac/W-v3_10", "sac/WHard-v3_1", "td3/W-v3_1"]
     assert find_runs(tmp_path / "none") == []
+    chosen = _groups(PlotOptions(algo=["td3", "sac"], env=["W-v3"], folder=str(tmp_path)))  # exactly, in the order given
+    names = [str(run.path.relative_to(tmp_path)) for group in chosen for run in group.runs]
+    assert names == ["td3/W-v3_1", "sac/W-v3_1", "sac/W-v3_2", "sac/W-v3_10"]
 
 
 # ---------------------------------------------------------------- groups

@@ -120,7 +120,10 @@ def test_nan_is_not_left_out():
 
 
 def test_summary():
-    assert summarise([2, 4, 4, 4, 5, 5, 7, 9]) == Summary(n=8, mean=5.0, std=2.0, iqm=4.5)
+    sample = [2, 4, 4, 4, 5, 5, 7, 9]
+    assert summarise(sample) == Summary(n=8, mean=5.0, std=2.0, iqm=4.5)
+    low, high = bootstrap_interval([sample])
+    assert 2 <= low < 4.5 < high <= 9
 
 
 STEPS = [100, 200, 300, 400, 500]

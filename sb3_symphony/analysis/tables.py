@@ -279,8 +279,10 @@ def _final_iqm(runs: Sequence[Result]) -> str:
     means = [each.final.mean() for each in runs if len(each.final)]
     if not means:
         return _NOTHING
+    if len(means) == 1:
+        return f"{means[0]:.1f}"
     low, high = bootstrap_interval([means])
-    return f"{iqm(means):.1f} ({low:.1f} … {high:.1f})" if len(means) > 1 else f"{iqm(means):.1f}"
+    return f"{iqm(means):.1f} ({low:.1f} … {high:.1f})"
 
 
 def _final_episodes(runs: Sequence[Result]) -> str:
