@@ -198,7 +198,8 @@ def test_quick_and_then_longer(folder, capsys):
     assert done(results) == ["td3/Pendulum-v1_0"]
     assert "final" not in json.loads((results / "td3" / "Pendulum-v1_0" / "result.json").read_text())
     quick = {**STUDY["quick"], "steps": 300, "final_episodes": 1}
-    assert main(["bench", str(write_study(folder, quick=quick)), "--quick"]) == 0
+    assert main(["bench", str(write_study(folder, quick=quick, device="auto")), "--quick"]) == 0  # may go on elsewhere
+    assert "device: auto" in (results / "td3" / "Pendulum-v1_0" / "Pendulum-v1" / "args.yml").read_text()
     result = json.loads((results / "td3" / "Pendulum-v1_0" / "result.json").read_text())
     assert result["steps"] == 300 and len(result["final"]["returns"]) == 1
     assert "resumed at 220" in (results / "td3" / "Pendulum-v1_0.log").read_text()

@@ -360,9 +360,11 @@ def test_command_and_options_are_kept(killed):
     run = killed(230, options(seed=-1))
     args = yaml.safe_load((run / "Pendulum-v1" / "args.yml").read_text())
     first = (run / "Pendulum-v1" / "command.txt").read_text()
-    assert main(["train", "--resume", str(run), "-n", "270"]) == 0
-    assert (run / "Pendulum-v1" / "command.txt").read_text() == f"{first}sb3-symphony train --resume {run} -n 270\n"
-    assert yaml.safe_load((run / "Pendulum-v1" / "args.yml").read_text()) == {**args, "n_timesteps": 270}
+    assert args["device"] == "auto"
+    assert main(["train", "--resume", str(run), "-n", "270", "--device", "cpu"]) == 0
+    command = f"sb3-symphony train --resume {run} -n 270 --device cpu\n"
+    assert (run / "Pendulum-v1" / "command.txt").read_text() == first + command
+    assert yaml.safe_load((run / "Pendulum-v1" / "args.yml").read_text()) == {**args, "n_timesteps": 270, "device": "cpu"}
 
 
 # ----------------------------------------------------------------------------------------------------------------------

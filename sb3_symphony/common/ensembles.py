@@ -227,7 +227,7 @@ class EnsembleCritic(BaseModel):
 TARGET_MODES = ("min", "mean", "rem")
 
 
-def combine(q_values: th.Tensor, mode: str, min_mix: float = 1.0) -> th.Tensor:
+def combine(q_values: th.Tensor, mode: str, min_mix: float | th.Tensor = 1.0) -> th.Tensor:
     """
     One value out of an ensemble's.
 
@@ -242,4 +242,5 @@ def combine(q_values: th.Tensor, mode: str, min_mix: float = 1.0) -> th.Tensor:
         weights = th.rand_like(q_values)
         return (q_values * weights).sum(dim=0) / weights.sum(dim=0)
     minimum = q_values.min(dim=0).values  # the gradient of each sample flows through its smallest critic only
-    return minimum if min_mix == 1.0 else min_mix * minimum + (1.0 - min_mix) * q_values.mean(dim=0)
+    plain = not isinstance(min_mix, th.Tensor) and min_mix == 1.0  # a tensor's value is on its device
+    return minimum if plain else min_mix * minimum + (1.0 - min_mix) * q_values.mean(dim=0)

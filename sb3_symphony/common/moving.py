@@ -9,6 +9,11 @@ from sb3_symphony.common.checks import check_number
 Moving = float | tuple[float, float, int, int]  # a number, or one that moves: (initial, final, first step, last step)
 
 
+def moves(value: Moving) -> bool:
+    """Whether a value is one that moves."""
+    return isinstance(value, (tuple, list))
+
+
 def at_step(value: Moving, step: int) -> float:
     """
     :param value: a number, or ``(a, b, s, t)``: ``a`` until step ``s``, then linearly to ``b`` at step ``t``, where it stays

@@ -5,8 +5,9 @@ import io
 import math
 import pathlib
 import warnings
+from abc import abstractmethod
 from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -32,6 +33,7 @@ from sb3_symphony.common.checks import check_choice, check_number, constructor_p
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CLASSIFICATION, CRITIC_LOSSES
 from sb3_symphony.common.noise import DecayingActionNoise
+from sb3_symphony.common.recordings import Recordings
 from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
@@ -240,6 +242,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self.critic_target = self.policy.critic_target
         self._has_batch_norm = bool(get_parameters_by_name(self.actor, ["running_"]))
         self._create_regression()  # of these critics
+        self._recordings = Recordings()
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
         assert self.env is not None, "You must set the environment before calling learn()"
@@ -313,6 +316,55 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
                     yield _rows(samples, start * batch_size, length * batch_size), batches
                 start += length
             gradient_steps -= draw
+
+    def _update(self, gradient_steps: int, batch_size: int, logs: UpdateLogs, **sample_kwargs: Any) -> None:
+        """
+        Make updates.
+
+        :param gradient_steps: Number of critic updates
+        :param batch_size: Transitions per update
+        :param logs: Where to add what is logged
+        :param sample_kwargs: Passed to ``replay_buffer.sample``
+        """
+        state = self._recorded_state()
+        for segment, batches in self._segments(gradient_steps, batch_size, **sample_kwargs):
+            if state is None:
+                self._learn_from(segment, batches, logs)
+            else:
+                self._learn_recorded(state, segment, batches, logs)
+
+    @abstractmethod
+    def _learn_from(self, segment: ReplayBufferSamples, batches: list[ReplayBufferSamples], logs: UpdateLogs) -> None:
+        """
+        One step of the critics with each minibatch of a segment, then, if the actor changes where it ends, one of the actor.
+
+        :param segment: See :meth:`_segments`
+        :param batches: The same
+        :param logs: Where to add what is logged
+        """
+
+    def _recorded_state(self) -> Hashable | None:
+        """What a recording of ``_learn_from`` on a GPU depends on besides transitions; ``None``: none is made."""
+        return None
+
+    def _learn_recorded(
+        self, state: Hashable, segment: ReplayBufferSamples, batches: list[ReplayBufferSamples], logs: UpdateLogs
+    ) -> None:
+        """``_learn_from``, by a recording of it."""
+        n_updates, logged_updates = self._n_updates, self._logged_updates
+        n_batches, batch_size = len(batches), len(batches[0].rewards)
+
+        def learn(segment: ReplayBufferSamples) -> dict[str, th.Tensor]:
+            values = update_logs()
+            self._learn_from(segment, [_rows(segment, i * batch_size, batch_size) for i in range(n_batches)], values)
+            return {key: th.stack(list(each)) for key, each in values.items()}
+
+        kind = state, n_batches, batch_size, n_updates % self.policy_delay, self.policy_delay, segment.discounts is None
+        outputs = self._recordings.run(kind, learn, segment, [self.actor.optimizer, self.critic.optimizer])
+        for key, values in outputs.items():
+            logs[key].extend(values)
+        # A replay does not count
+        self._n_updates, self._logged_updates = n_updates + n_batches, logged_updates + n_batches
 
     def _fit_critics(self, batch: ReplayBufferSamples, target: th.Tensor, logs: UpdateLogs) -> None:
         """
@@ -441,7 +493,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             end_trajectory(loaded)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression"]
+        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression", "_recordings"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

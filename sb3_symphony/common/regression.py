@@ -122,7 +122,11 @@ class CriticRegression:
         loss.backward()
         self.critic.optimizer.step()
 
-        polyak_update(self.critic.parameters(), self.critic_target.parameters(), tau)
+        with th.no_grad():  # the numbers of SB3's polyak_update, in two kernels of a GPU
+            parameters: list[th.Tensor] = list(self.critic.parameters())
+            targets: list[th.Tensor] = list(self.critic_target.parameters())
+            th._foreach_mul_(targets, 1 - tau)
+            th._foreach_add_(targets, parameters, alpha=tau)
         polyak_update(self.running_stats, self.running_stats_target, 1.0)
         return Fit(loss.detach(), self.objective.values(outputs.detach()))
 

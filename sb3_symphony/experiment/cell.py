@@ -271,7 +271,7 @@ def run_cell(job: Job) -> bool:
     run = RunFolder(Path(job.run), RunFolder.file_name(options.env))
     if begun(run):
         _wait_for_predecessor(run)
-        onward = {name: getattr(options, name) for name in ("algo", "n_timesteps", "save_freq")}
+        onward = {name: getattr(options, name) for name in ("algo", "n_timesteps", "save_freq", "device")}
         again = TrainOptions(resume=str(run.path), **onward)
         result = train(again, _command(options))
     else:
@@ -285,7 +285,7 @@ def run_cell(job: Job) -> bool:
         "steps": result.steps,
         "updates": _updates(run.model),
         "seconds": round(_seconds(run, options.n_timesteps) if result.untouched else result.seconds, 3),
-        "machine": _machine(),
+        "machine": _machine(options.device),
         **({"final": _evaluated(job, {})} if job.final_episodes else {}),
         **({"conditions": _under_conditions(job)} if job.conditions else {}),
     }
@@ -319,8 +319,9 @@ def _seconds(run: RunFolder, n_timesteps: int) -> float:
     return checkpoint.state["elapsed"] / 1e9
 
 
-def _machine() -> dict[str, Any]:
+def _machine(device: str) -> dict[str, Any]:
     import torch as th
+    from stable_baselines3.common.utils import get_device
 
     from sb3_symphony.experiment.backends import package_versions
 
@@ -328,6 +329,7 @@ def _machine() -> dict[str, Any]:
         "host": socket.gethostname(),
         "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
         "cores": os.cpu_count(),
+        **({"gpu": th.cuda.get_device_name()} if get_device(device).type == "cuda" else {}),
         **package_versions(),
     }
 

@@ -71,7 +71,7 @@ class Progress:
 
 
 #: options of ``train`` that results depend on
-_DECISIVE = ("algo", "env", "seed", "eval_freq", "eval_episodes", "protocol", "threshold", "device")
+_DECISIVE = ("algo", "env", "seed", "eval_freq", "eval_episodes", "protocol", "threshold")
 
 
 def standings(study: Study, path: Path, folder: Path) -> list[Progress]:

@@ -21,7 +21,7 @@ from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
 #: options that may differ from those the run was started with. Only schedules depend on any of them, on the first
-_CHANGEABLE = {"n_timesteps", "save_freq", "keep", "verbose", "progress", "quiet", "json_file"}
+_CHANGEABLE = {"n_timesteps", "save_freq", "keep", "device", "verbose", "progress", "quiet", "json_file"}
 
 
 @dataclass

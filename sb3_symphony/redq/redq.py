@@ -216,33 +216,35 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         self._update_learning_rate(optimizers)
 
         logs = update_logs()
-
-        # The actor and the temperature are frozen inside a segment: one forward pass gives all its next actions
-        for segment, batches in self._segments(gradient_steps, batch_size):
-            with th.no_grad():
-                if self.use_sde:
-                    self.actor.reset_noise()
-                ent_coef = self._current_ent_coef()
-                next_actions, next_log_probs = self.actor.action_log_prob(segment.next_observations)
-                next_actions, entropies = next_actions.split(batch_size), (-ent_coef * next_log_probs).split(batch_size)
-
-            for batch, next_action, entropy in zip(batches, next_actions, entropies, strict=True):
-                with th.no_grad():
-                    # Minimum over the subset, one draw for the whole batch: (subset_size, batch, 1) -> (batch, 1)
-                    next_q_values = self._regression.target_q_values(batch.next_observations, next_action, self._draw_subset())
-                    next_values = combine(next_q_values, self.target_mode) + entropy.reshape(-1, 1)
-                    target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
-                self._fit_critics(batch, target, logs)
-
-            if self._n_updates % self.policy_delay == 0:
-                self._update_actor(batches[-1], ent_coef, logs)
-                self.policy.average_actor()
+        self._update(gradient_steps, batch_size, logs)
 
         action_dist = self.actor.action_dist
         self._log_update(logs, noise_std=action_dist.distribution.stddev.detach().mean())
         for name in ("distribution", "gaussian_actions", "_latent_sde"):
             if hasattr(action_dist, name):
                 setattr(action_dist, name, None)  # they hold the last graph, and a policy with one cannot be copied
+
+    def _learn_from(self, segment: ReplayBufferSamples, batches: list[ReplayBufferSamples], logs: UpdateLogs) -> None:
+        # The actor and the temperature are frozen inside a segment: one forward pass gives all its next actions
+        with th.no_grad():
+            if self.use_sde:
+                self.actor.reset_noise()
+            ent_coef = self._current_ent_coef()
+            next_actions, next_log_probs = self.actor.action_log_prob(segment.next_observations)
+            entropies = -ent_coef * next_log_probs
+
+        n = len(batches)
+        for batch, next_action, entropy in zip(batches, next_actions.chunk(n), entropies.chunk(n), strict=True):
+            with th.no_grad():
+                # Minimum over the subset, one draw for the whole batch: (subset_size, batch, 1) -> (batch, 1)
+                next_q_values = self._regression.target_q_values(batch.next_observations, next_action, self._draw_subset())
+                next_values = combine(next_q_values, self.target_mode) + entropy.reshape(-1, 1)
+                target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
+            self._fit_critics(batch, target, logs)
+
+        if self._n_updates % self.policy_delay == 0:
+            self._update_actor(batches[-1], ent_coef, logs)
+            self.policy.average_actor()
 
     def _update_actor(self, batch: ReplayBufferSamples, ent_coef: th.Tensor, logs: UpdateLogs) -> None:
         """One step of the actor toward the mean of all critics, then one of the entropy coefficient."""

@@ -100,7 +100,8 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
         see :class:`~sb3_symphony.common.losses.ValueBins`
     :param n_bins: Their number of bins
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
-        fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
+        fused wherever it is possible. On a GPU ``"auto"`` records all updates as CUDA graphs, if networks are plain and their
+        optimizers Adam or AdamW. The results are equal up to rounding. ``"bf16"`` is fused with large products in
         bfloat16: less precise, and up to 1.6 times as fast where networks are large and the processor has it
     :param actor_averaging: Above 0, ``predict(..., deterministic=True)`` asks an average of the actor's weights over about
         this part of its updates so far (0.125: the last eighth); training is the same without, but for ``GreedyEpisodes``

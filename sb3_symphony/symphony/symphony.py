@@ -1,4 +1,5 @@
 import zlib
+from collections.abc import Hashable
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -11,13 +12,14 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
+from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number, check_pair
 from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
-from sb3_symphony.common.moving import Moving, at_step, check_moving
+from sb3_symphony.common.moving import Moving, at_step, check_moving, moves
 from sb3_symphony.common.noise import DecayingNormalActionNoise
 from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, UpdateLogs, noise_std, update_logs
+from sb3_symphony.common.recordings import recorded_state
 from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
 
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
@@ -198,6 +200,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         super()._setup_model()
         if self._drawn_weights is None:
             self._drawn_weights = self._actor_weights()
+        self._mixes = th.zeros(2, device=self.device)
         self._set_mixes()
         # Mean value at the previous update, which the actor's loss compares with
         self.baseline = th.zeros((), device=self.device)
@@ -229,32 +232,46 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         self._log_update(logs, noise_std(self.action_noise))
 
     def _set_mixes(self) -> None:
-        """Weights of the minimum, in the target and for the actor, at the present step."""
-        self.target_mix, self.actor_mix = (at_step(each, self.num_timesteps) for each in _pair(self.min_mix))
+        """Weights of the minimum, in the target and for the actor, at the present step: in one place if they move."""
+        self.target_mix, self.actor_mix = (
+            place.fill_(at_step(mix, self.num_timesteps)) if moves(mix) else mix
+            for mix, place in zip(_pair(self.min_mix), self._mixes, strict=True)
+        )
 
-    def _update(self, gradient_steps: int, batch_size: int, logs: UpdateLogs, **sample_kwargs: Any) -> None:
+    def _learn_from(self, segment: ReplayBufferSamples, batches: list[ReplayBufferSamples], logs: UpdateLogs) -> None:
         # The actor is frozen inside a segment: one forward pass gives all its next actions
-        for segment, batches in self._segments(gradient_steps, batch_size, **sample_kwargs):
+        with th.no_grad():
+            next_actions = self.actor(segment.next_observations)
+            if self.target_policy_noise > 0:
+                noise = self.target_policy_noise * th.randn_like(next_actions).clamp(-2.5, 2.5)
+                next_actions = (next_actions + noise).clamp(-1, 1)
+
+        for batch, next_action in zip(batches, next_actions.chunk(len(batches)), strict=True):
             with th.no_grad():
-                next_actions = self.actor(segment.next_observations)
-                if self.target_policy_noise > 0:
-                    noise = self.target_policy_noise * th.randn_like(next_actions).clamp(-2.5, 2.5)
-                    next_actions = (next_actions + noise).clamp(-1, 1)
+                # The online actor; minimum over the critics: (n_critics, batch, 1) -> (batch, 1)
+                next_q_values = self._regression.target_q_values(batch.next_observations, next_action)
+                next_values = combine(next_q_values, self.target_mode, self.target_mix)
+                target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
 
-            for batch, next_action in zip(batches, next_actions.split(batch_size), strict=True):
-                with th.no_grad():
-                    # The online actor; minimum over the critics: (n_critics, batch, 1) -> (batch, 1)
-                    next_q_values = self._regression.target_q_values(batch.next_observations, next_action)
-                    next_values = combine(next_q_values, self.target_mode, self.target_mix)
-                    target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_values
+            # The author moves the target critics before he computes the target; moving them right after the
+            # critics' step, as here, gives the same numbers
+            self._fit_critics(batch, target, logs)
 
-                # The author moves the target critics before he computes the target; moving them right after the
-                # critics' step, as here, gives the same numbers
-                self._fit_critics(batch, target, logs)
+        if self._n_updates % self.policy_delay == 0:
+            self._update_actor(batches[-1], logs)
+            self.policy.average_actor()
 
-            if self._n_updates % self.policy_delay == 0:
-                self._update_actor(batches[-1], logs)
-                self.policy.average_actor()
+    def _recorded_state(self) -> Hashable | None:
+        if self.device.type != "cuda" or self.policy.critic_engine != "auto":
+            return None
+        if type(self) is not Symphony or vars(self).keys() & {"_learn_from", "_fit_critics", "_update_actor"}:
+            return None  # what is overridden may do something in Python
+        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
+            return None  # priorities go back to the CPU
+        state = recorded_state(self.policy, [self.actor.optimizer, self.critic.optimizer])
+        mixes = [mix.data_ptr() if isinstance(mix, th.Tensor) else mix for mix in (self.target_mix, self.actor_mix)]
+        numbers = (self.tau, self.gamma, self.target_mode, *mixes, self.target_policy_noise, self.saturation_penalty)
+        return state and (state, *numbers, self.actor_loss, self.baseline.data_ptr())
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: UpdateLogs) -> None:
         """One step of the actor toward the combined critics."""
@@ -319,6 +336,9 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_mixes", "target_mix", "actor_mix"]  # made again from min_mix
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts, tensors = super()._get_torch_save_params()
