@@ -50,12 +50,14 @@ def test_which_algorithm(tmp_path, monkeypatch, capsys):
     assert "6 queued" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_your_own_robot(tmp_path, monkeypatch):
     total = run_page("your-own-robot.md", tmp_path, monkeypatch)["total"]
     assert json.loads(Path("robot.json").read_text())["mean_length"] > 240  # of 250; an untrained one falls within 40
     assert total > 150  # of 250
 
 
+@pytest.mark.slow
 def test_notebook(tmp_path, monkeypatch):
     nbclient = pytest.importorskip("nbclient")
     nbformat = pytest.importorskip("nbformat")

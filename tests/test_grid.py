@@ -32,14 +32,14 @@ STUDY = {
         {"name": "sac-2", "algo": "sac", "overrides": {**SMALL, "gradient_steps": 2}},
     ],
     "environments": [{"id": "Pendulum-v1", "threshold": -1200}],
-    "seeds": 3,
+    "seeds": 2,
     "steps": 450,
     "save_freq": 100,
     "final_episodes": 2,
     "protocol": {"eval_freq": 150, "eval_episodes": 1},
     "quick": {"algorithms": ["td3"], "seeds": 1, "steps": 220, "final_episodes": 0},
 }
-CELLS = sorted(f"{algorithm}/Pendulum-v1_{seed}" for algorithm in ("td3", "sac-2") for seed in range(3))
+CELLS = sorted(f"{algorithm}/Pendulum-v1_{seed}" for algorithm in ("td3", "sac-2") for seed in range(2))
 
 CRASH = """
 import os, signal
@@ -137,7 +137,7 @@ def test_results(whole):
 
 
 def test_a_cell_is_the_run_of_its_command(whole, folder):
-    run = whole / "td3" / "Pendulum-v1_2"
+    run = whole / "td3" / "Pendulum-v1_1"
     command = (run / "Pendulum-v1" / "command.txt").read_text().split()
     assert main([*command[1:], "-f", "alone"]) == 0
     assert_same_results(folder / "alone" / "td3" / "Pendulum-v1_1", run)
@@ -178,7 +178,7 @@ def test_curves_are_drawn_of_unfinished_runs_too(whole, folder):
     assert main(["bench", str(whole.parent / "study.yml"), "-f", "results", "--report"]) == 0
     for name in ("evaluations.png", "training.png"):
         assert (folder / "results" / name).read_bytes() == (whole / name).read_bytes()
-    assert re.search(r"td3 \(non-standard\) +\| 0 of 3 ", (folder / "results" / "table.md").read_text())
+    assert re.search(r"td3 \(non-standard\) +\| 0 of 2 ", (folder / "results" / "table.md").read_text())
 
 
 def test_dry_run(whole, folder, capsys):
@@ -186,9 +186,9 @@ def test_dry_run(whole, folder, capsys):
     assert main(["bench", study, "--dry-run"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + len(CELLS) and re.search(r"^td3/Pendulum-v1_0 +queued +0 / 450$", lines[1])
-    assert lines[-1] == "6 queued" and list(folder.iterdir()) == []
+    assert lines[-1] == f"{len(CELLS)} queued" and list(folder.iterdir()) == []
     assert main(["bench", study, "--dry-run", "-f", str(whole)]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "6 done"
+    assert capsys.readouterr().out.splitlines()[-1] == f"{len(CELLS)} done"
 
 
 def test_quick_and_then_longer(folder, capsys):
@@ -424,7 +424,7 @@ def test_ray_gives_the_same_results(whole, cluster, folder):
     assert main(["bench", study, "--backend", "ray", "--address", cluster.address, "-f", str(folder / "results")]) == 0
     assert_same_grid(folder / "results", whole)
     results = [json.loads((folder / "results" / name / "result.json").read_text()) for name in CELLS]
-    assert len(results) == 6
+    assert len(results) == 4
 
 
 def test_a_folder_that_is_not_shared_is_refused(cluster, folder, capsys):
@@ -587,4 +587,4 @@ def test_a_result_that_is_none(whole, folder, capsys):
     shutil.copytree(whole, folder / "copy")
     (folder / "copy" / "td3" / "Pendulum-v1_0" / "result.json").write_text("{}")
     assert main(["bench", str(whole.parent / "study.yml"), "-f", "copy", "--dry-run"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "1 queued, 5 done"
+    assert capsys.readouterr().out.splitlines()[-1] == f"1 queued, {len(CELLS) - 1} done"

@@ -29,6 +29,7 @@ def test_identity(make, algorithm, replay_buffer_class):
     assert mean > 85
 
 
+@pytest.mark.slow
 def test_her_solves_bit_flipping(make, algorithm):
     env = make_vec_env(lambda: BitFlippingEnv(n_bits=3, continuous=True, max_steps=3), seed=0)
     options = fast(algorithm, gamma=0.9, policy="MultiInputPolicy", replay_buffer_class=HerReplayBuffer, buffer_size=5000)

@@ -346,8 +346,9 @@ def test_a_run_without_evaluations_is_told(logs, capsys, figures):
 def test_the_log_of_a_run_is_found(tmp_path, monkeypatch, figures):
     monkeypatch.chdir(tmp_path)
     argv = "train --algo td3 --env Pendulum-v1 -n 450 --eval-freq 0 --no-progress --verbose 0 -tb tb --log-interval 1"
+    small = ["learning_starts:100", "buffer_size:500", "policy_kwargs.net_arch:[16]"]
     for seed in ("0", "1"):
-        assert main([*argv.split(), "--seed", seed, "-params", "learning_starts:100", "buffer_size:500"]) == 0
+        assert main([*argv.split(), "--seed", seed, "-params", *small]) == 0
     logs = [open_run(tmp_path / f"logs/td3/Pendulum-v1_{k}").log for k in (1, 2)]
     assert logs == [tmp_path / f"tb/Pendulum-v1/TD3_{k}" for k in (1, 2)]
     monkeypatch.chdir(tmp_path / "logs")

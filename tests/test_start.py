@@ -390,7 +390,8 @@ def test_actions_of_any_shape_with_noise(kinds, noise, actions):
 @pytest.mark.parametrize("algo", ["sac", "redq"])
 def test_agent_of_a_run_that_saved_memory(kinds, algo):
     memory = ["optimize_memory_usage:true", "replay_buffer_kwargs:{handle_timeout_termination: false}"]
-    memory += ["replay_buffer_class:ReplayBuffer"] * (algo == "redq")
+    if algo == "redq":
+        memory += ["replay_buffer_class:ReplayBuffer", "gradient_steps:1", "policy_kwargs.net_arch:[16]"]
     assert main([*kinds, *memory, "--algo", algo, "--eval-freq", "0"]) == 0
     assert main(f"evaluate --algo {algo} --env Kinds-v0 --gym-packages kinds -n 1".split()) == 0
 

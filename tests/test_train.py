@@ -54,7 +54,7 @@ def test_a_picture_that_fails_costs_no_model(folder, capsys, monkeypatch, error)
     def broken(path):
         raise error
 
-    monkeypatch.setattr("sb3_symphony.experiment.train.plot_training", broken)
+    monkeypatch.setattr("sb3_symphony.analysis.plots.plot_training", broken)
     run = train(options()).run
     assert TD3.load(run.model).num_timesteps == 250
     assert f"note: training.png was not drawn — {reason(error)}" in capsys.readouterr().err

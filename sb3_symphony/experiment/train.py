@@ -17,7 +17,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_symphony.analysis.plots import plot_training
 from sb3_symphony.common.checkpoint import Checkpoint, DoesNotFit, ExactCheckpoints, platform_of
 from sb3_symphony.experiment.agent import check_device
 from sb3_symphony.experiment.callbacks import (
@@ -226,6 +225,8 @@ def build_callbacks(options: TrainOptions, config: RunConfig, model: BaseAlgorit
 def _save_model(model: BaseAlgorithm, run: RunFolder) -> None:
     """The model comes last and at once: a run whose model has all steps has everything."""
     try:
+        from sb3_symphony.analysis.plots import plot_training  # drawing takes a second to import
+
         plot_training(run.path)
     except Exception as error:  # whatever a drawing library stumbles over, a full disk too: the model matters
         print(f"note: training.png was not drawn — {reason(error)}", file=sys.stderr)
