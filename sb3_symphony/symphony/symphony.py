@@ -264,7 +264,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     def _recorded_state(self) -> Hashable | None:
         if self.device.type != "cuda" or self.policy.critic_engine != "auto":
             return None
-        if type(self) is not Symphony or vars(self).keys() & {"_learn_from", "_fit_critics", "_update_actor"}:
+        own = type(self) is Symphony and type(self.policy) is SymphonyPolicy
+        if not own or vars(self).keys() & {"_learn_from", "_fit_critics", "_update_actor"}:
             return None  # what is overridden may do something in Python
         if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
             return None  # priorities go back to the CPU
