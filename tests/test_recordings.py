@@ -9,7 +9,8 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_symphony import Symphony
+from sb3_symphony import REDQ, DroQ, Symphony
+from sb3_symphony.common.buffers import PrioritizedReplayBuffer
 from sb3_symphony.common.recordings import WARM_UPS, Recording, Recordings, recorded_state
 
 on_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
@@ -200,6 +201,28 @@ def test_other_optimizers_are_not_recorded(small):
 def test_nothing_is_recorded_on_the_cpu(small):
     model = small(Symphony).learn(60)
     assert model._recorded_state() is None and not model._recordings._recordings
+
+
+def test_only_our_own_updates_are_recorded(small):
+    class Own(Symphony):
+        pass
+
+    def state(cls=Symphony, **kwargs):
+        model = small(cls, **kwargs)
+        model.device = th.device("cuda")  # its networks are not looked at
+        return model, model._recorded_state()
+
+    model, first = state()
+    assert first is not None and model._recorded_state() == first
+    for name, value in {"tau": 0.5, "target_policy_noise": 0.3, "actor_loss": "mean", "baseline": th.zeros(())}.items():
+        before = model._recorded_state()
+        setattr(model, name, value)
+        assert model._recorded_state() not in (None, before)
+    model._update_actor = lambda *args: None
+    assert model._recorded_state() is None
+    assert state(Own)[1] is None and state(REDQ)[1] is None and state(DroQ)[1] is None
+    assert state(policy_kwargs={"critic_engine": "autograd"})[1] is None
+    assert state(replay_buffer_class=PrioritizedReplayBuffer)[1] is None
 
 
 # ---------------------------------------------------------------------------------------------------------------- on a GPU

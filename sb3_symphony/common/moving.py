@@ -1,6 +1,6 @@
 """Arguments that may move with the environment step."""
 
-from typing import Any
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from sb3_symphony.common.checks import check_number
 Moving = float | tuple[float, float, int, int]  # a number, or one that moves: (initial, final, first step, last step)
 
 
-def moves(value: Moving) -> bool:
+def moves(value: Moving) -> TypeGuard[tuple[float, float, int, int]]:
     """Whether a value is one that moves."""
     return isinstance(value, (tuple, list))
 
@@ -20,10 +20,10 @@ def at_step(value: Moving, step: int) -> float:
     :param step: the environment step
     :return: its value there
     """
-    if not isinstance(value, (tuple, list)):
-        return value
-    initial, final, first, last = value
-    return float(np.interp(step, (first, last), (initial, final)))
+    if moves(value):
+        initial, final, first, last = value
+        return float(np.interp(step, (first, last), (initial, final)))
+    return cast(float, value)
 
 
 def check_moving(name: str, value: Any, low: float, high: float = np.inf) -> None:
@@ -37,7 +37,7 @@ def check_moving(name: str, value: Any, low: float, high: float = np.inf) -> Non
     :raises TypeError: if a number is none, or a step is not whole
     :raises ValueError: if a number is out of range, steps do not rise, or there are not four
     """
-    if not isinstance(value, (tuple, list)):
+    if not moves(value):
         check_number(name, value, low, high)
         return
     if len(value) != 4:

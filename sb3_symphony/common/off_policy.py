@@ -33,7 +33,7 @@ from sb3_symphony.common.checks import check_choice, check_number, constructor_p
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CLASSIFICATION, CRITIC_LOSSES
 from sb3_symphony.common.noise import DecayingActionNoise
-from sb3_symphony.common.recordings import Recordings
+from sb3_symphony.common.recordings import Recordings, recorded_state
 from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
@@ -102,6 +102,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         NStepReplayBuffer,
         ReplayBuffer,
     )
+    # What ``_learn_from`` reads, of a class whose updates on a GPU are recorded; classes derived from it have to say so anew
+    recorded_attributes: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -311,9 +313,9 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             while start < draw:
                 until_actor = self.policy_delay - self._n_updates % self.policy_delay
                 length = min(draw - start, until_actor, longest)
-                batches = [_rows(samples, (start + i) * batch_size, batch_size) for i in range(length)]
+                segment = _rows(samples, start * batch_size, length * batch_size)
                 with self._regression.unchanged():
-                    yield _rows(samples, start * batch_size, length * batch_size), batches
+                    yield segment, _minibatches(segment, length, batch_size)
                 start += length
             gradient_steps -= draw
 
@@ -345,7 +347,17 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _recorded_state(self) -> Hashable | None:
         """What a recording of ``_learn_from`` on a GPU depends on besides transitions; ``None``: none is made."""
-        return None
+        if self.device.type != "cuda" or self.policy.critic_engine != "auto":
+            return None
+        # What is overridden may do something in Python
+        own = "recorded_attributes" in vars(type(self)) and type(self.policy) in self.policy_aliases.values()
+        if not own or vars(self).keys() & {"_learn_from", "_fit_critics", "_update_actor"}:
+            return None
+        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
+            return None  # priorities go back to the CPU
+        state = recorded_state(self.policy, [self.actor.optimizer, self.critic.optimizer])
+        values = [getattr(self, name) for name in self.recorded_attributes]
+        return state and (state, *(value.data_ptr() if isinstance(value, th.Tensor) else value for value in values))
 
     def _learn_recorded(
         self, state: Hashable, segment: ReplayBufferSamples, batches: list[ReplayBufferSamples], logs: UpdateLogs
@@ -356,7 +368,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
         def learn(segment: ReplayBufferSamples) -> dict[str, th.Tensor]:
             values = update_logs()
-            self._learn_from(segment, [_rows(segment, i * batch_size, batch_size) for i in range(n_batches)], values)
+            self._learn_from(segment, _minibatches(segment, n_batches, batch_size), values)
             return {key: th.stack(list(each)) for key, each in values.items()}
 
         kind = state, n_batches, batch_size, n_updates % self.policy_delay, self.policy_delay, segment.discounts is None
@@ -377,8 +389,9 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         weights = getattr(batch, "weights", None)
         loss, q_values = self._regression.fit(batch.observations, batch.actions, target, self.tau, weights)
         if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
-            # Priority of a transition: its error averaged over the critics. Samples of this buffer alone have indices
-            self.replay_buffer.update_priorities(batch.indices, (target - q_values).abs().mean(dim=0))  # type: ignore[attr-defined]
+            # Priority of a transition: its error averaged over the critics
+            errors = (target - q_values).abs().mean(dim=0)
+            self.replay_buffer.update_priorities(batch.indices, errors)  # type: ignore[attr-defined]  # this buffer's have it
         self._n_updates += 1
         self._logged_updates += 1
         logs["critic_loss"].append(loss)
@@ -508,6 +521,10 @@ def _rows(samples: ReplayBufferSamples, start: int, length: int) -> Any:
         return None if field is None else field[start : start + length]
 
     return type(samples)(*map(cut, samples))
+
+
+def _minibatches(segment: ReplayBufferSamples, n_batches: int, batch_size: int) -> list[ReplayBufferSamples]:
+    return [_rows(segment, i * batch_size, batch_size) for i in range(n_batches)]
 
 
 def noise_std(action_noise: ActionNoise | None) -> float:

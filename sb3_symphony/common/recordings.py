@@ -14,6 +14,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
+from sb3_symphony.common.hooks import are_hooked
+
 WARM_UPS = 3  # plain calls before a recording: optimisers, cuBLAS and the allocator set up what they keep
 MAX_RECORDINGS = 16  # of the latest kinds of calls
 
@@ -129,25 +131,18 @@ def recorded_state(policy: nn.Module, optimizers: Sequence[th.optim.Optimizer]) 
     :param optimizers: All that are stepped
     :return: ``None`` if more happens than kernels (hooks), or something is not known to be recordable
     """
-    modules = list(policy.modules())
-    if any(m._forward_hooks or m._forward_pre_hooks or m._backward_hooks or m._backward_pre_hooks for m in modules):
+    modules, parameters = list(policy.modules()), list(policy.parameters())
+    if are_hooked(modules, parameters, optimizers):
         return None
     if any(isinstance(m, BaseFeaturesExtractor) and type(m) is not FlattenExtractor for m in modules):
         return None
     for optimizer in optimizers:
         if type(optimizer) not in (th.optim.Adam, th.optim.AdamW) or not all(g["fused"] for g in optimizer.param_groups):
             return None
-        if "step" in vars(optimizer) or optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
-            return None
-    parameters = list(policy.parameters())
-    if any(p._backward_hooks or p._post_accumulate_grad_hooks for p in parameters):
-        return None
     states = [state for optimizer in optimizers for each in optimizer.state.values() for state in each.values()]
     tensors = [*parameters, *policy.buffers(), *states]
-    options = [
-        sorted((name, str(value)) for name, value in group.items() if name not in ("params", "lr", "initial_lr"))
-        for group in _groups(optimizers)
-    ]
+    apart = ("params", "lr", "initial_lr")
+    options = [{name: value for name, value in group.items() if name not in apart} for group in _groups(optimizers)]
     return (
         tuple(tensor.data_ptr() for tensor in tensors),
         tuple(parameter.requires_grad for parameter in parameters),

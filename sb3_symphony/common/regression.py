@@ -19,6 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from sb3_symphony.common.ensembles import EnsembleCritic, StackedMLP
 from sb3_symphony.common.fused import FusedNetwork, are_same, array, parameters_of, uncovered
+from sb3_symphony.common.hooks import are_hooked
 from sb3_symphony.common.kernels import adam_polyak
 from sb3_symphony.common.losses import CRITIC_LOSS_SLOPES, CRITIC_LOSSES, ValueBins
 
@@ -303,16 +304,12 @@ def _has_more_than_passes(critic: EnsembleCritic) -> bool:
     """
     network, optimizer = critic.q_networks, _optimizer_of(critic)
     modules = (critic, network, *network.layers)
-    if any(m._forward_hooks or m._forward_pre_hooks or m._backward_hooks or m._backward_pre_hooks for m in modules):
-        return True
     parameters = parameters_of(network)
     if not all(parameter.is_contiguous() for parameter in parameters):
         return True
     if optimizer is None:
-        return False
-    if "step" in vars(optimizer) or optimizer._optimizer_step_pre_hooks or optimizer._optimizer_step_post_hooks:
-        return True
-    return any(p._backward_hooks or p._post_accumulate_grad_hooks or not p.requires_grad for p in parameters)
+        return are_hooked(modules, [], [])
+    return are_hooked(modules, parameters, [optimizer]) or not all(parameter.requires_grad for parameter in parameters)
 
 
 def not_fusable(critic: EnsembleCritic) -> str | None:

@@ -20,7 +20,8 @@ from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions,
 from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
-#: options that may differ from those the run was started with. Only schedules depend on any of them, on the first
+#: options that may differ from those the run was started with. Schedules depend on the first of them, rounding on the
+#: device, results on no other
 _CHANGEABLE = {"n_timesteps", "save_freq", "keep", "device", "verbose", "progress", "quiet", "json_file"}
 
 

@@ -1,5 +1,4 @@
 import zlib
-from collections.abc import Hashable
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -12,14 +11,13 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer, PrioritizedReplayBuffer
+from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number, check_pair
 from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
 from sb3_symphony.common.moving import Moving, at_step, check_moving, moves
 from sb3_symphony.common.noise import DecayingNormalActionNoise
 from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, UpdateLogs, noise_std, update_logs
-from sb3_symphony.common.recordings import recorded_state
 from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
 
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
@@ -97,6 +95,10 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     policy: SymphonyPolicy
     actor: Actor
     default_buffers = (FadingDictReplayBuffer, FadingReplayBuffer, FadingReplayBuffer)
+    recorded_attributes = (
+        *("tau", "gamma", "target_mode", "target_mix", "actor_mix", "target_policy_noise"),
+        *("saturation_penalty", "actor_loss", "baseline"),
+    )
 
     def __init__(
         self,
@@ -260,19 +262,6 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         if self._n_updates % self.policy_delay == 0:
             self._update_actor(batches[-1], logs)
             self.policy.average_actor()
-
-    def _recorded_state(self) -> Hashable | None:
-        if self.device.type != "cuda" or self.policy.critic_engine != "auto":
-            return None
-        own = type(self) is Symphony and type(self.policy) is SymphonyPolicy
-        if not own or vars(self).keys() & {"_learn_from", "_fit_critics", "_update_actor"}:
-            return None  # what is overridden may do something in Python
-        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
-            return None  # priorities go back to the CPU
-        state = recorded_state(self.policy, [self.actor.optimizer, self.critic.optimizer])
-        mixes = [mix.data_ptr() if isinstance(mix, th.Tensor) else mix for mix in (self.target_mix, self.actor_mix)]
-        numbers = (self.tau, self.gamma, self.target_mode, *mixes, self.target_policy_noise, self.saturation_penalty)
-        return state and (state, *numbers, self.actor_loss, self.baseline.data_ptr())
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: UpdateLogs) -> None:
         """One step of the actor toward the combined critics."""
