@@ -275,7 +275,7 @@ class ExactCheckpoints(BaseCallback):
         if (buffer := self._buffer) is not None:  # that of an earlier training may have rows; others may have been loaded
             rows = buffer.pos + buffer.buffer_size * buffer.full
             self._rows_before = rows - self.model.num_timesteps // self.model.n_envs
-            self.segments.segments, self.segments.saved = [], 0
+            self.segments.forget()
 
     def _on_rollout_start(self) -> None:
         if self._restoring is not None:

@@ -78,6 +78,10 @@ class ReplaySegments:
         self.segments = [segment for segment in self.segments if segment.stop > first]
         return list(self.segments)
 
+    def forget(self) -> None:
+        """All rows have changed: they are to be written again, whatever is on disk."""
+        self.segments, self.saved = [], 0
+
     def forget_latest(self) -> None:
         """The latest row has changed: it is to be written again."""
         self.saved = max(self.saved - 1, 0)

@@ -219,13 +219,13 @@ def _draw_curves(figure: PlotOptions, results: Sequence["Result"], output: Path)
 
 def _draw_gaits(figure: Drawing, results: Sequence["Result"], output: Path) -> None:
     from sb3_symphony.experiment.gait import gait
-    from sb3_symphony.experiment.select import GaitOptions, checkpoints
+    from sb3_symphony.experiment.select import GaitOptions
 
     assert figure.gait_at is not None
     agents: dict[str, Path] = {}
     for each in results:
         assert each.run is not None
-        saved = checkpoints(RunFolder(each.run.path, ""))
+        saved = RunFolder(each.run.path, "").saved_models()
         episodes = each.run.episodes
         if each.algorithm not in agents and saved and episodes is not None and len(episodes.steps) >= figure.gait_at:
             end = int(episodes.steps[figure.gait_at - 1])

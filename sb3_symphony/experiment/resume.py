@@ -159,9 +159,9 @@ def restore_files(run: RunFolder, checkpoint: Checkpoint | None) -> None:
     contents = checkpoint.state["files"] if checkpoint else {}
     if checkpoint is None and run.model.is_file():
         steps = model_steps(run.model)
-        run.model.rename(run.path / f"rl_model_{steps}_steps.zip")
+        run.model.rename(run.model_at(steps))
         if run.normalization.is_file():
-            run.normalization.rename(run.path / f"rl_model_vecnormalize_{steps}_steps.pkl")
+            run.normalization.rename(run.normalization_at(steps))
     for path in run.growing_files():
         if path.name not in contents:
             path.unlink()

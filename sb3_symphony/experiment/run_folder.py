@@ -12,6 +12,15 @@ from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.registry import without_folder, without_module
 
 
+def steps_in_name(model: Path) -> int | None:
+    """
+    :param model: file of a model
+    :return: the number of steps after which it was saved, if it is one of those that are saved on the way
+    """
+    name = re.fullmatch(r"rl_model_(\d+)_steps", model.stem)
+    return int(name[1]) if name else None
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """
@@ -95,6 +104,19 @@ class RunFolder:
     def best_normalization(self) -> Path:
         """Statistics of ``VecNormalize`` that belong to ``best_model.zip``."""
         return self.path / "best_model_vecnormalize.pkl"
+
+    def model_at(self, steps: int) -> Path:
+        """The model that was saved after so many steps."""
+        return self.path / f"rl_model_{steps}_steps.zip"
+
+    def normalization_at(self, steps: int) -> Path:
+        """Statistics of ``VecNormalize`` that belong to :meth:`model_at`."""
+        return self.path / f"rl_model_vecnormalize_{steps}_steps.pkl"
+
+    def saved_models(self) -> dict[int, Path]:
+        """:return: number of steps → model saved then, in ascending order"""
+        found = ((steps_in_name(path), path) for path in self.path.glob("rl_model_*_steps.zip"))
+        return dict(sorted((steps, path) for steps, path in found if steps is not None))
 
     @property
     def checkpoints(self) -> Path:

@@ -4,7 +4,6 @@ Which trained agent: the flags that `evaluate`, `enjoy`, `video`, `gait` and `ex
 Only paths and YAML are read here, nothing heavy is imported; :mod:`sb3_symphony.experiment.agent` loads what was found.
 """
 
-import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from sb3_symphony.experiment.config import (
     shipped_folder,
 )
 from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder, without_module
-from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.run_folder import RunFolder, steps_in_name
 
 _DEFAULT_ALGO, _DEFAULT_ENV = TrainOptions().algo, TrainOptions().env
 
@@ -211,9 +210,9 @@ def _normalization(options: SelectOptions, model: Path, run: RunFolder | None, s
         return path
     if run is None or settings.normalize is False:
         return None
-    checkpoint = re.fullmatch(r"rl_model_(\d+)_steps", model.stem)
-    if checkpoint:
-        own = model.with_name(f"rl_model_vecnormalize_{checkpoint[1]}_steps.pkl")
+    steps = steps_in_name(model)
+    if steps is not None:
+        own = run.normalization_at(steps)
     else:
         own = run.best_normalization if model.stem == "best_model" else run.normalization
     for path in (own, run.normalization):
@@ -264,26 +263,13 @@ def _find_run(options: SelectOptions) -> RunFolder:
     return run
 
 
-def checkpoints(run: RunFolder) -> dict[int, Path]:
-    """
-    :param run: run folder
-    :return: number of steps → model saved then, in ascending order
-    """
-    found = {}
-    for path in run.path.glob("rl_model_*_steps.zip"):
-        steps = re.fullmatch(r"rl_model_(\d+)_steps", path.stem)
-        if steps:
-            found[int(steps[1])] = path
-    return dict(sorted(found.items()))
-
-
 def _model_of(run: RunFolder, options: SelectOptions) -> Path:
     if options.load_best:
         if not run.best_model.is_file():
             raise ConfigError(f"--load-best: {run.best_model} is missing — the run had no evaluation")
         return run.best_model
     if options.load_last_checkpoint or options.load_checkpoint is not None:
-        saved = checkpoints(run)
+        saved = run.saved_models()
         flag = "--load-last-checkpoint" if options.load_last_checkpoint else "--load-checkpoint"
         if not saved:
             raise ConfigError(f"{flag}: {run.path} has no checkpoint — `train --save-freq` makes them")

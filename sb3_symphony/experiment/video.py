@@ -3,7 +3,6 @@
 import errno
 import math
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -26,7 +25,7 @@ from stable_baselines3.common.env_util import unwrap_wrapper
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError, told
 from sb3_symphony.experiment.output import output_file, output_folder, progress_bar
-from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.run_folder import RunFolder, steps_in_name
 from sb3_symphony.experiment.select import AgentsOptions, Selection, SelectOptions, VideoOptions
 
 SUFFIXES = (".mp4", ".gif")
@@ -108,11 +107,11 @@ def _labels(selections: Sequence[Selection]) -> list[str]:
     """Algorithm and which of a run's models, environment and folder only where they differ: ``redq``, ``redq 4k steps``."""
     labels = []
     for selection in selections:
-        label, steps = selection.algo, re.fullmatch(r"rl_model_(\d+)_steps", selection.model.stem)
+        label, steps = selection.algo, steps_in_name(selection.model)
         if selection.model.stem == "best_model":
             label += " best"
-        elif steps:
-            label += f" {EngFormatter(sep='')(int(steps[1]))} steps"
+        elif steps is not None:
+            label += f" {EngFormatter(sep='')(steps)} steps"
         if len({other.env_id for other in selections}) > 1:
             label += f" on {selection.env_id}"
         labels.append(label)
