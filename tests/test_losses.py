@@ -224,8 +224,9 @@ def test_cross_entropy_and_its_slope(weighted):
     each = th.stack([F.cross_entropy(critic, bins.probabilities(target), reduction="none") for critic in logits])  # (2, 6)
     th.testing.assert_close(loss, (each * (1 if weights is None else weights[:, 0])).mean(dim=1))
     (slope,) = th.autograd.grad(loss.sum(), logits)
-    same_loss, own_slope = bins.loss_and_slope(logits, target, weights)
+    same_loss, own_slope, values = bins.loss_slope_and_values(logits, target, weights)
     assert th.equal(same_loss, loss)
+    th.testing.assert_close(values, bins.values(logits))
     th.testing.assert_close(own_slope, slope)
 
 

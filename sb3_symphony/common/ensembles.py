@@ -242,5 +242,6 @@ def combine(q_values: th.Tensor, mode: str, min_mix: float | th.Tensor = 1.0) ->
         weights = th.rand_like(q_values)
         return (q_values * weights).sum(dim=0) / weights.sum(dim=0)
     minimum = q_values.min(dim=0).values  # the gradient of each sample flows through its smallest critic only
-    plain = not isinstance(min_mix, th.Tensor) and min_mix == 1.0  # a tensor's value is on its device
-    return minimum if plain else min_mix * minimum + (1.0 - min_mix) * q_values.mean(dim=0)
+    if isinstance(min_mix, th.Tensor):  # its value is on its device
+        return th.lerp(q_values.mean(dim=0), minimum, min_mix.to(minimum.dtype))
+    return minimum if min_mix == 1.0 else th.lerp(q_values.mean(dim=0), minimum, min_mix)

@@ -56,6 +56,19 @@ def _sin_cos(x, real):
 
 
 @_compiled
+def positions_from_gaps(gaps, last, stop):
+    """Turn gaps, in place, into the positions that follow ``last``; returns the latest, and how many are below ``stop``."""
+    count = 0
+    for k in range(gaps.size):
+        last += gaps[k]
+        gaps[k] = last
+        if last >= stop:
+            break
+        count += 1
+    return last, count
+
+
+@_compiled
 def _mark(factors, value, start, dropped, k):
     """Set the factors of what is dropped of a row that begins at position ``start``, from ``dropped[k]`` on; returns ``k``."""
     while k < dropped.size and dropped[k] < start + factors.size:

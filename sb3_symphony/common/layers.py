@@ -7,6 +7,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_symphony.common.kernels import positions_from_gaps
+
 
 class LeakySine(nn.Module):
     """
@@ -41,12 +43,13 @@ def draw_dropped(n_elements: int, rate: float) -> np.ndarray:
     """
     if rate > 0.1:
         return th.empty(n_elements, dtype=th.uint8).bernoulli_(1 - rate).eq(0).nonzero().view(-1).numpy()
-    drawn = [np.array([-1])]
-    while drawn[-1][-1] < n_elements:  # once, nearly always
+    drawn: list[np.ndarray] = []
+    last = -1
+    while last < n_elements:  # once, nearly always
         gaps = th.empty(int(1.2 * rate * n_elements) + 8, dtype=th.int64).geometric_(rate).numpy()
-        drawn.append(np.cumsum(gaps) + drawn[-1][-1])
-    positions = np.concatenate(drawn[1:])
-    return positions[: positions.searchsorted(n_elements)]
+        last, count = positions_from_gaps(gaps, last, n_elements)
+        drawn.append(gaps[:count])
+    return drawn[0] if len(drawn) == 1 else np.concatenate(drawn)
 
 
 class Dropout(nn.Dropout):

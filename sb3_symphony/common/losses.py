@@ -170,17 +170,20 @@ class ValueBins(nn.Module):
         :param weights: Importance weights ``(batch, 1)`` of a prioritised replay
         :return: The loss of each critic ``(n_critics,)``
         """
-        return self._loss(logits, self.probabilities(target), weights)
+        return self._loss(logits.log_softmax(dim=-1), self.probabilities(target), weights)
 
-    def loss_and_slope(
+    def loss_slope_and_values(
         self, logits: th.Tensor, target: th.Tensor, weights: th.Tensor | None = None
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """The loss, and its derivative with respect to ``logits``."""
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """The loss, its derivative with respect to ``logits``, and the values expected."""
         wanted = self.probabilities(target)
-        return self._loss(logits, wanted, weights), _share(logits.softmax(dim=-1) - wanted, weights)
+        log_probabilities = logits.log_softmax(dim=-1)
+        probabilities = log_probabilities.exp()
+        loss = self._loss(log_probabilities, wanted, weights)
+        return loss, _share(probabilities - wanted, weights), probabilities @ self.centers
 
-    def _loss(self, logits: th.Tensor, wanted: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
-        return _mean(-(wanted * logits.log_softmax(dim=-1)).sum(dim=-1, keepdim=True), weights)
+    def _loss(self, log_probabilities: th.Tensor, wanted: th.Tensor, weights: th.Tensor | None) -> th.Tensor:
+        return _mean(-(wanted * log_probabilities).sum(dim=-1, keepdim=True), weights)
 
 
 CRITIC_LOSSES: dict[str, CriticLoss] = {"mse": mse, "huber": huber, "rehe": rehe, "rehe_elementwise": rehe_elementwise}

@@ -59,12 +59,14 @@ class Error:
         """
         return self._loss(self._error(outputs, target), weights)
 
-    def loss_and_slope(self, outputs: th.Tensor, target: th.Tensor, weights: th.Tensor | None) -> tuple[th.Tensor, th.Tensor]:
-        """The losses, and the derivative of their sum with respect to ``outputs``."""
+    def loss_slope_and_values(
+        self, outputs: th.Tensor, target: th.Tensor, weights: th.Tensor | None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """The losses, the derivative of their sum with respect to ``outputs``, and the values, in memory of their own."""
         error = self._error(outputs, target)
         # d error / d outputs = -1, or -1 / n_critics where the error is that of their mean
         slope = self._slope(error, weights).expand_as(outputs) * (-len(error) / len(outputs))
-        return self._loss(error, weights), slope
+        return self._loss(error, weights), slope, outputs.clone()
 
     def values(self, outputs: th.Tensor) -> th.Tensor:
         """The critics' values ``(n_critics, batch, 1)``, maybe in the same memory."""
@@ -219,8 +221,7 @@ class FusedRegression(CriticRegression):
         with th.no_grad():
             features = self.critic.extract_features(observations, self.critic.features_extractor)
             outputs = network.forward(features, actions)
-            q_values = self.objective.values(outputs).clone()
-            loss, slope = self.objective.loss_and_slope(outputs, target, weights)
+            loss, slope, q_values = self.objective.loss_slope_and_values(outputs, target, weights)
             network.backward(slope)
             self._step(network, tau)
             return Fit(loss.sum(), q_values)
