@@ -40,6 +40,7 @@ def run_page(name, folder, monkeypatch):
     return namespace
 
 
+@pytest.mark.slow
 def test_tour(tmp_path, monkeypatch):
     run_page("tour.md", tmp_path, monkeypatch)
     assert json.loads(Path("walker.json").read_text())["episodes"] == 5

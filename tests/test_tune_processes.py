@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import optuna
+import pytest
 from optuna.trial import TrialState
 from postgres_helpers import needs_postgres, postgres  # noqa: F401  # a fixture
 from tune_helpers import files, start
@@ -109,6 +110,7 @@ def test_server_that_does_not_come_back(postgres, tmp_path):  # noqa: F811
     assert {reason_of(trial) for trial in trials if trial.state == FAIL} <= {"its process died"}
 
 
+@pytest.mark.slow
 def test_disk_that_fills_up(small_disk, tmp_path):
     """The journal is waited for; once there is room, the same command goes on, with all that had been found."""
     where, filler = small_disk / "journal.log", small_disk / "filler"
