@@ -184,7 +184,7 @@ def test_find_runs_takes_names_exactly(tmp_path):
         ("td3", "W-v3", 1),
         ("sac", "WHard-v3", 1),
     ]:
-        make_run(tmp_path, algo, env, number=number)
+        make_run(tmp_path, algo, env, number=number, seed=number)
     (tmp_path / "sac" / "W-v3_77").mkdir()  # not a run
     names = [str(run.path.relative_to(tmp_path)) for run in find_runs(tmp_path)]
     assert names == ["sac/W-v3_1", "sac/W-v3_2", "sac/W-v3_10", "sac/WHard-v3_1", "td3/W-v3_1"]
@@ -203,6 +203,23 @@ def test_seeds_of_one_configuration_are_a_group(tmp_path):
     (longer / "X-v0" / "config.yml").write_text(yaml.safe_dump({"n_timesteps": 999, "gamma": 0.9}))
     groups = group_runs([*runs, open_run(longer), open_run(make_run(tmp_path, "td3"))])
     assert [(group.label, len(group.runs)) for group in groups] == [("sac", 4), ("td3", 1)]
+
+
+def test_a_seed_counts_once(tmp_path, capsys):
+    for number, (seed, rows) in enumerate([(0, 1), (0, 3), (1, 1), (0, 2)], 1):
+        path = make_run(tmp_path, number=number, seed=seed, gamma=0.9)
+        write_monitor(path / "0.monitor.csv", 0.0, [(1.0, 10, 1.0)] * rows)
+    (group,) = _groups(PlotOptions(folder=str(tmp_path)))
+    assert [run.path.name for run in group.runs] == ["X-v0_2", "X-v0_3"]
+    told = capsys.readouterr().err.splitlines()
+    assert told == [f"left out: {tmp_path}/sac/X-v0_{k}: has the seed and settings of {tmp_path}/sac/X-v0_2" for k in (1, 4)]
+
+
+def test_groups_are_named_apart(tmp_path):
+    settings = [{"gamma": 0.9, "tau": 0.1, "batch_size": 8}, {"gamma": 0.99, "tau": 0.2, "batch_size": 16}]
+    runs = [open_run(make_run(tmp_path / name, **each)) for name, each in zip("ab", settings, strict=True)]
+    groups = group_runs([*runs, open_run(make_run(tmp_path, "td3"))])
+    assert [group.label for group in groups] == ["sac 1 (a/sac/X-v0_1)", "sac 1 (b/sac/X-v0_1)", "td3"]
 
 
 def test_runs_that_start_elsewhere_are_another_group(tmp_path):

@@ -511,6 +511,19 @@ def test_a_replay_buffer_without_horizon(small, tmp_path):
     assert model.replay_buffer is own
 
 
+def test_a_replay_buffer_of_more_environments(small, tmp_path):
+    small(REDQ, n_envs=2).learn(30).save_replay_buffer(tmp_path / "buffer")
+    model = small(REDQ)
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match="n_envs=1: the saved ReplayBuffer is of 2 environments"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is own
+
+
+def test_a_subset_that_is_not_drawn(small):
+    assert small(REDQ, n_critics=1, target_mode="mean").learn(30).num_timesteps == 30
+
+
 def test_a_noise_is_an_object(small):
     with pytest.raises(TypeError, match="action_noise='default': expected an ActionNoise or None"):
         small(REDQ, action_noise="default")

@@ -128,6 +128,16 @@ def test_how_many_depends_on_what_recent_ones_return():
     assert of_episodes(seen) == expected
 
 
+def test_a_training_in_pieces_goes_on_alike():
+    """Pieces that end within episodes, which go on."""
+    callback, note = GreedyEpisodes(ALWAYS, in_row=(2, 9), n_episodes=1), Note()
+    model, seen = make("symphony", Fixed(), learning_starts=1), []
+    for _ in range(10):
+        model.learn(LENGTH - 1, callback=[callback, note], reset_num_timesteps=False)
+        seen += note.seen
+    assert of_episodes(seen) == [False, True, True, False, True, True, False, True]
+
+
 def test_without_the_callback_no_action_is_greedy():
     assert not any(each[0] for each in greedy_steps("symphony", Fixed(), 30, learning_starts=5))
 

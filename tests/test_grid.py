@@ -23,6 +23,7 @@ from test_cli import fails
 from sb3_symphony.cli import main
 from sb3_symphony.experiment import cell as cell_module
 from sb3_symphony.experiment.cell import Control, Job, Outcome, supervise
+from sb3_symphony.experiment.grid import BenchOptions, bench
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
 STUDY = {
@@ -179,6 +180,26 @@ def test_curves_are_drawn_of_unfinished_runs_too(whole, folder):
     for name in ("evaluations.png", "training.png"):
         assert (folder / "results" / name).read_bytes() == (whole / name).read_bytes()
     assert re.search(r"td3 \(non-standard\) +\| 0 of 2 ", (folder / "results" / "table.md").read_text())
+
+
+def test_a_study_beside_is_left_alone(folder, capsys, monkeypatch):
+    (folder / "mine" / "inside").mkdir(parents=True)
+    write_study(folder / "mine").rename(folder / "mine" / "other.yml")
+    kept = write_study(folder / "mine", seeds=1)
+    monkeypatch.chdir(folder / "mine")
+    for flags in ([], ["--dry-run"]):
+        assert main(["bench", "other.yml", "-f", ".", *flags]) == 2
+        (error,) = capsys.readouterr().err.splitlines()
+        assert f"-f: '{folder / 'mine'}' has a study.yml of its own" in error
+    assert yaml.safe_load(kept.read_text()) == {**STUDY, "seeds": 1}
+    assert sorted(path.name for path in (folder / "mine").iterdir()) == ["inside", "other.yml", "study.yml"]
+
+
+def test_results_are_named_after_the_folder_of_a_study(folder, monkeypatch):
+    (folder / "mine" / "inside").mkdir(parents=True)
+    write_study(folder / "mine")
+    monkeypatch.chdir(folder / "mine" / "inside")
+    assert bench(BenchOptions(study="../study.yml", dry_run=True)).folder == folder / "mine" / "inside" / "logs/bench/mine"
 
 
 def test_dry_run(whole, folder, capsys):

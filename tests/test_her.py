@@ -1,5 +1,7 @@
 """Hindsight experience replay with goal environments."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
@@ -41,6 +43,13 @@ def test_her(make_her, goal_selection_strategy, n_envs):
     assert not th.equal(parameters(model), before)
     assert th.isfinite(parameters(model)).all()
     assert "train/critic_loss" in model.logger.name_to_value
+
+
+def test_a_second_training_warns_of_nothing(make_her):
+    model = make_her()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.learn(32).learn(32)
 
 
 def test_her_is_deterministic(make_her):

@@ -188,6 +188,34 @@ def test_rewards_are_normalised_as_in_training():
         q_bias(small(TD3, Chain()), own)
 
 
+def test_a_loaded_model_is_measured_in_what_is_given(tmp_path):
+    train_env = VecNormalize(DummyVecEnv([Chain]), gamma=GAMMA)
+    model = small(TD3, train_env).learn(60)
+    model.save(tmp_path / "model")
+    train_env.save(tmp_path / "normalize.pkl")
+    own = VecNormalize.load(tmp_path / "normalize.pkl", DummyVecEnv([Chain]))
+    expected = q_bias(model, VecNormalize(DummyVecEnv([Chain])), n_pairs=7)
+    assert q_bias(TD3.load(tmp_path / "model"), own, n_pairs=7) == expected
+    assert own.ret_rms.var == train_env.ret_rms.var
+
+
+def test_observations_that_are_numbers():
+    class Steps(gym.Env):
+        observation_space = gym.spaces.Discrete(5)
+        action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.position = 0
+            return 0, {}
+
+        def step(self, action):
+            self.position += 1
+            return self.position, 1.0, False, self.position == 4, {}
+
+    assert q_bias(small(REDQ, Steps()), Steps(), n_pairs=8).n_pairs == 8
+
+
 def test_a_measurement_repeats():
     model = small(SAC, Chain())
     assert q_bias(model, Chain(), n_pairs=20) == q_bias(model, Chain(), n_pairs=20)

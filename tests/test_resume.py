@@ -355,7 +355,18 @@ def test_finished_run_goes_on_to_more_steps(algo):
     assert result.steps == 384
     assert_same_results(whole, run.path)
     assert yaml.safe_load((run.details / "config.yml").read_text())["n_timesteps"] == 384
-    assert resume(run.path).untouched  # the larger number is remembered
+    again = resume(run.path)
+    assert again.untouched  # the larger number is remembered
+    assert again.evaluation == result.evaluation and 0 < again.seconds <= result.seconds + 60
+
+
+def test_from_inside_the_folder(killed, monkeypatch):
+    run = killed(230, options(eval_freq=100))
+    monkeypatch.chdir(run)
+    assert main(["train", "--resume", "."]) == 0
+    with np.load("evaluations.npz") as data:
+        assert data["timesteps"].tolist() == [100, 200]
+    assert resume(".").untouched
 
 
 def test_command_and_options_are_kept(killed):

@@ -97,6 +97,7 @@ def test_model_file_in_a_run_needs_nothing_else(folder):
     fails("--algo: td3 — logs/sac/Pendulum-v1_1/best_model.zip was trained with sac", model=found.model.as_posix(), algo="td3")
     fails("--load-best: chooses among the models of a run", model="logs/sac/Pendulum-v1_1/best_model.zip", load_best=True)
     fails("--exp-id: 2", model="logs/sac/Pendulum-v1_1", exp_id=2)
+    fails("-f: 'elsewhere' — expected --model or -f to look for runs", model="logs/sac/Pendulum-v1_1", folder="elsewhere")
 
 
 def test_model_file_from_elsewhere(folder):
@@ -118,6 +119,8 @@ def test_without_run_folder(folder):
     found = select(exp_id=-1)
     assert found.model.as_posix() == "logs/symphony/BipedalWalker-v3.zip"
     assert (found.algo, found.env_id, found.run) == ("symphony", "BipedalWalker-v3", None)
+    fails("--load-best: chooses among the models of a run — --exp-id -1", exp_id=-1, load_best=True)
+    fails("--load-checkpoint: chooses among", exp_id=-1, load_checkpoint=7)
 
 
 def test_flags_about_the_environment_come_first(folder):

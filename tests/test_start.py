@@ -303,6 +303,23 @@ def test_own_algorithm_of_another_folder(folder, capsys):
     assert train(TrainOptions(resume=str(run), algo=own, n_timesteps=80)).steps == 80
 
 
+def test_own_algorithm_that_cannot_be_imported(folder, capsys):
+    (folder / "broken_one.py").write_text("import nowhere_to_be_found\n")
+    (folder / "agent.zip").touch()
+    for argv in ("train --conf-file td3", "evaluate --model agent.zip"):
+        command = [*argv.split(), "--algo", "broken_one.py:Own", "--env", "Pendulum-v1"]
+        assert main(command) == 2
+        (error,) = capsys.readouterr().err.splitlines()
+        assert "--algo: " in error and "broken_one.py: cannot be imported — ModuleNotFoundError: No module named" in error
+    assert not (folder / "logs").exists()
+
+
+def test_a_folder_that_is_not_in_utf8(folder, capsys):
+    assert main(["train", "--algo", "td3", "--env", "Pendulum-v1", "-f", "bad\udcff"]) == 2
+    assert "--log-folder: 'bad\\udcff' cannot be written — expected a name in UTF-8" in capsys.readouterr().err
+    assert not list(folder.iterdir())
+
+
 def test_own_on_policy_algorithm(folder):
     """It may have what off-policy ones may not: discrete actions, and stacked frames that are normalised."""
     (folder / "my_own_ppo.py").write_text("from stable_baselines3 import PPO\nclass Own(PPO):\n    pass\n")

@@ -205,6 +205,7 @@ def test_sweeps_conditions_and_figures(write, tmp_path):
     cell.found.write_text("n_timesteps: 5\ngamma: 0.7\n")
     found = cells_of(study, tmp_path, tmp_path / "results")[0]
     assert not found.waits and configuration(found).arguments == {"gamma": 0.7}
+    assert read_study(write(sweeps={})).sweeps == {}
 
 
 def test_algorithms_of_a_file(write, tmp_path):

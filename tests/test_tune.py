@@ -370,6 +370,13 @@ def test_a_study_of_somebody_else_is_left_alone(played, options, tmp_path):
 # What is found --------------------------------------------------------------------------------------------------------
 
 
+def test_a_folder_that_cannot_be_written(played, options, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"--log-folder: .* cannot be written"):
+        tune(options(storage="journal.log", log_folder="file"))
+    assert not list(tmp_path.glob("*journal*"))
+
+
 def test_files(played, options, tmp_path, monkeypatch):
     monkeypatch.setattr(SweepReport, "_draw", DRAW)
     result = tune(options(n_trials=6))

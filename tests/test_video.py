@@ -227,6 +227,9 @@ def test_a_run_keeps_its_films(tmp_path, monkeypatch, capsys):
     argv = "train --algo td3 --env Pendulum-v1 -n 60 --eval-freq 0 --no-progress --verbose 0 --seed 0 --save-freq 50"
     assert main([*argv.split(), "-params", "buffer_size:100"]) == 0
     capsys.readouterr()
+    run = "logs/td3/Pendulum-v1_1"
+    assert main(["video", run, run, "-n", "10", "--no-progress"]) == 2  # two agents in one film
+    assert not (tmp_path / run / "videos").exists() and "would be the film of two agents" in capsys.readouterr().err
     assert main("video --algo td3 --env Pendulum-v1 --load-checkpoint 50 -n 10 --no-progress".split()) == 0
     out = capsys.readouterr().out.strip()
     assert out == "logs/td3/Pendulum-v1_1/videos/rl_model_50_steps.mp4"

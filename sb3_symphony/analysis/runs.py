@@ -6,7 +6,8 @@ import logging
 import os
 import re
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -346,7 +347,7 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
     Put runs together that differ in seed and length only.
 
     Groups of the same algorithm and environment are told apart by up to two hyper-parameters that differ, if their values
-    are short, else by the numbers of their folders.
+    are short, else by the numbers of their folders, and by their paths if these are the same.
 
     :param runs: any runs
     :return: groups in the order of their first runs
@@ -374,4 +375,23 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
         elif keys:
             label += f" {', '.join(run.path.absolute().name.rpartition('_')[2] for run in group.runs)}"
         labelled.append(replace(group, label=label))
-    return labelled
+    names = Counter((group.label, group.env) for group in labelled)
+    twice = [group for group in labelled if names[group.label, group.env] > 1]
+    labels = iter(named_apart([group.label for group in twice], [group.runs[0].path for group in twice]))
+    return [replace(group, label=next(labels)) if names[group.label, group.env] > 1 else group for group in labelled]
+
+
+def named_apart(names: Sequence[str], paths: Sequence[Path]) -> list[str]:
+    """
+    Tell apart what has the same name, by as little of the paths as is needed.
+
+    :param names: names
+    :param paths: where what they name lies
+    :return: other names, if some are the same
+    """
+    parts = [path.absolute().parts for path in paths]
+    for depth in range(max(map(len, parts), default=0)):
+        told = [f"{name} ({'/'.join(path[-depth:])})" if depth else name for name, path in zip(names, parts, strict=True)]
+        if len(set(told)) == len(told):
+            return told
+    return list(names)  # one of them several times

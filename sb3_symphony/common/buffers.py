@@ -8,6 +8,7 @@ one SB3 seeds.
 
 import copy
 import math
+import warnings
 from collections.abc import Mapping
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
@@ -391,14 +392,17 @@ def check_mirror(buffer: ReplayBuffer | None, env: VecNormalize | None) -> None:
 
 def end_trajectory(buffer: ReplayBuffer) -> None:
     """
-    Mark that the latest transition is not followed by the next one to come: the environments start anew.
+    Mark that the latest transition is not followed by the next one to come: the environments start anew. This package's
+    algorithms do it where they reset environments; under SB3's own, call it before a ``learn()`` that does.
 
     :param buffer: replay buffer
     """
     if buffer.size() == 0:
         return
     if isinstance(buffer, HerReplayBuffer):
-        buffer.truncate_last_trajectory()
+        with warnings.catch_warnings():  # SB3's advice is for a buffer that was loaded
+            warnings.simplefilter("ignore", UserWarning)
+            buffer.truncate_last_trajectory()
     else:
         last = buffer.pos - 1
         if not buffer.optimize_memory_usage:  # else the next observation will be that of another episode

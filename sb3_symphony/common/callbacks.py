@@ -251,7 +251,8 @@ class GreedyEpisodes(_OnReturn):
             raise TypeError(f"model: expected one with greedy episodes, such as Symphony, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
-        self.row = [0] * self.training_env.num_envs
+        if self.num_timesteps == 0 or len(self.row) != self.training_env.num_envs:  # else episodes go on
+            self.row = [0] * self.training_env.num_envs
         self.start_anew()
 
     def start_anew(self) -> None:

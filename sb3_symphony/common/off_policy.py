@@ -489,12 +489,16 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         priorities) stays what was saved, whatever ``replay_buffer_class`` and ``replay_buffer_kwargs`` say.
 
         :param truncate_last_traj: Whether the buffer's last episode ends there; else it is the one that the model is in
-        :raises ValueError: if the model needs n-step returns and the buffer has none; the model's own buffer then stays
+        :raises ValueError: if the buffer is of another number of environments, or has no n-step returns and the model needs
+            them; the model's own buffer then stays
         """
         before = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
         loaded = self.replay_buffer
         assert loaded is not None
+        if loaded.n_envs != self.n_envs:
+            self.replay_buffer = before
+            raise ValueError(f"n_envs={self.n_envs}: the saved {type(loaded).__name__} is of {loaded.n_envs} environments")
         if isinstance(loaded, NStepReplayBuffer):
             loaded.n_steps, loaded.gamma = self.n_steps, self.gamma
         elif self.n_steps > 1:

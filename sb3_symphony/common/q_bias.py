@@ -135,6 +135,9 @@ def _prepared(env: gym.Env | VecEnv, model: OffPolicyAlgorithm) -> VecEnv:
     if vec_env.num_envs != 1:
         raise ValueError(f"env: expected one environment, got {vec_env.num_envs}")
     learned, own = model.get_vec_normalize_env(), unwrap_vec_normalize(vec_env)
+    if model.env is None and own is not None:  # a loaded model does not tell what it was trained in
+        own.training = False
+        return vec_env
     if (learned is None) != (own is None):
         need = "VecNormalize around it, as around the training environment" if own is None else "none of VecNormalize"
         raise ValueError(f"env: expected {need}")
@@ -168,7 +171,8 @@ def q_bias(
 
     :param model: SAC, TD3, DDPG, TQC, CrossQ, Symphony, REDQ, DroQ or a class derived from them
     :param env: environment of its own, with the rewards that are learned from (so with wrappers that transform them) and,
-        if the model has it, ``VecNormalize``, whose statistics are copied from training and whose ``training`` is set to False
+        if the model has it, ``VecNormalize``, whose ``training`` is set to False and whose statistics are copied from training
+        (of a model that was loaded without its environment: are what they are)
     :param n_pairs: number of pairs after which no further episode is begun
     :param max_episode_steps: number of pairs kept of each episode
     :param seed: seed of environment and actions, so that a model is always measured on the same draws
@@ -212,8 +216,8 @@ def q_bias(
 
 def _batch_of_one(observation: Any) -> Any:
     if isinstance(observation, dict):
-        return {key: value[None] for key, value in observation.items()}
-    return observation[None]
+        return {key: np.asarray(value)[None] for key, value in observation.items()}
+    return np.asarray(observation)[None]  # that of a Discrete space may be a number
 
 
 class QBiasCallback(BaseCallback):

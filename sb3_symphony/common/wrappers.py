@@ -84,8 +84,9 @@ class LearningReward(gym.Wrapper):
     """
     Base of wrappers that change the reward a learner sees, never the one that is reported.
 
-    Reported returns come from ``Monitor``, so it has to sit inside: if there is none, one is put there (SB3 adds its own
-    only where none is found, and would otherwise report changed rewards). ``info["raw_reward"]`` holds the environment's
+    Reported returns come from ``Monitor``, so it has to sit inside: if there is none, one is put there. An algorithm that is
+    given such an environment adds no other; ``make_vec_env`` always puts one around what a function gives it, so there hand
+    the wrapper over as ``wrapper_class``, which comes outside. ``info["raw_reward"]`` holds the environment's
     reward of the step, whatever number of these wrappers are stacked. Evaluate without them.
 
     :param env: environment, with or without a ``Monitor``

@@ -217,7 +217,10 @@ def load_model(selection: Selection, device: str = "auto") -> BaseAlgorithm:
     :return: the model, without environment
     :raises ConfigError: if the file is damaged or of another algorithm
     """
-    algorithm = load_algorithm(selection.algo)
+    try:
+        algorithm = load_algorithm(selection.algo)
+    except ValueError as error:  # of a user's own file
+        raise ConfigError(f"--algo: {error}") from error
     _check_archive(selection, algorithm)
     if selection.run is None and not selection.shipped:
         _tell_of_pickles()

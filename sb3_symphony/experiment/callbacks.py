@@ -150,7 +150,8 @@ class SeededEvaluation(EvalCallback):
         **kwargs: Any,
     ) -> None:
         super().__init__(eval_env, **kwargs)
-        self.log_path = None if log_path is None else str(log_path / ".evaluations.tmp.npz")
+        # SB3 makes the folder that is written before the name, so there has to be one, if only "."
+        self.log_path = None if log_path is None else os.path.join(log_path, ".evaluations.tmp.npz")
         self.stop_reward = stop_reward
         self.stop = stop
         self.threshold = threshold

@@ -280,11 +280,13 @@ def run_cell(job: Job) -> bool:
         result = train(options, _command(options), run.path)
     if result.interrupted:
         return False
+    told = read_result(run.path) if result.untouched else None
+    seconds = round(result.seconds, 3)
     content = {
         "n_timesteps": options.n_timesteps,
         "steps": result.steps,
         "updates": _updates(run.model),
-        "seconds": round(_seconds(run, options.n_timesteps) if result.untouched else result.seconds, 3),
+        "seconds": told["seconds"] if told is not None and told["n_timesteps"] == options.n_timesteps else seconds,
         "machine": _machine(options.device),
         **({"final": _evaluated(job, {})} if job.final_episodes else {}),
         **({"conditions": _under_conditions(job)} if job.conditions else {}),
@@ -305,18 +307,6 @@ def _wait_for_predecessor(run: RunFolder) -> None:
 def _updates(model: Path) -> int:
     with zipfile.ZipFile(model) as archive:
         return int(json.loads(archive.read("data"))["_n_updates"])
-
-
-def _seconds(run: RunFolder, n_timesteps: int) -> float:
-    """Wall-clock time of a run that had ended before: as it was told then, or else as its last checkpoint has it."""
-    from sb3_symphony.common.checkpoint import newest_checkpoint
-
-    told = read_result(run.path)
-    if told is not None and told["n_timesteps"] == n_timesteps:
-        return float(told["seconds"])
-    checkpoint = newest_checkpoint(run.checkpoints)
-    assert checkpoint is not None  # a run is finished when it has its last one
-    return checkpoint.state["elapsed"] / 1e9
 
 
 def _machine(device: str) -> dict[str, Any]:

@@ -11,6 +11,7 @@ Results lie in one folder, which holds all that is needed to go on or to make th
     <folder>/cells.csv, episodes.csv, matrix.csv, table.md, evaluations.png, training.png, matrix.png, …
 """
 
+import os
 import shutil
 import threading
 import time
@@ -112,9 +113,11 @@ def bench(options: BenchOptions) -> BenchResult:
     if options.page is not None:
         on_page(options.page, "")
     study = read_study(path, options.quick, options.algo)
-    name = path.absolute().parent.name if path.stem == "study" else path.stem
+    name = Path(os.path.abspath(path)).parent.name if path.stem == "study" else path.stem
     study = study.model_copy(update={"title": study.title or name})
     folder = Path(options.folder or f"logs/bench/{name}{'_quick' if options.quick else ''}").absolute()
+    if not options.report:
+        _check_kept_study(path, folder)
     progress = standings(study, path, folder)
     if options.dry_run:
         from sb3_symphony.experiment.grid_view import plain_table
@@ -139,6 +142,14 @@ def bench(options: BenchOptions) -> BenchResult:
 # ----------------------------------------------------------------------------------------------------------------------
 # Before
 # ----------------------------------------------------------------------------------------------------------------------
+
+
+def _check_kept_study(path: Path, folder: Path) -> None:
+    """Results have a copy of their study; a ``study.yml`` that is none is left alone."""
+    kept = folder / "study.yml"
+    holds_results = (folder / "settings").is_dir() and not folder.samefile(path.parent)
+    if kept.is_file() and not holds_results and not kept.samefile(path) and kept.read_bytes() != path.read_bytes():
+        raise ConfigError(f"-f: '{folder}' has a study.yml of its own, which would be replaced — expected another folder")
 
 
 def _check_models(progress: Sequence[Progress]) -> None:

@@ -72,6 +72,10 @@ def check_folder(name: str | Path, flag: str) -> None:
     :raises ConfigError: if it could not
     """
     path = Path(name).absolute()
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:  # files of a run name it
+        raise ConfigError(f"{flag}: {str(name)!r} cannot be written — expected a name in UTF-8") from None
     for folder in (path, *path.parents):
         try:
             os.stat(folder)

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -126,7 +126,7 @@ def _groups(options: PlotOptions) -> "list[Group]":
         runs = [run for run in runs if not envs or run.env in envs]
         if not runs:
             raise ConfigError(f"no runs in '{options.folder}' — expected <algo>/<env>_<k>/ there; `train` makes them")
-    groups = group_runs(runs)
+    groups = [replace(group, runs=_each_seed_once(group.runs)) for group in group_runs(runs)]
     names = list(dict.fromkeys(group.label for group in groups))
     if options.labels:
         if len(options.labels) != len(names):
@@ -134,6 +134,29 @@ def _groups(options: PlotOptions) -> "list[Group]":
         renamed = dict(zip(names, options.labels, strict=True))
         groups = [replace(group, label=renamed[group.label]) for group in groups]
     return groups
+
+
+def _each_seed_once(runs: "list[Run]") -> "list[Run]":
+    """Of runs with the same settings and seed the one that came farthest: twice, it would count as two seeds."""
+    kept: dict[Any, Run] = {}
+    for run in runs:
+        seed = run.path if run.seed is None else run.seed
+        other = kept.get(seed)
+        if other is not None:
+            farther = run if _steps_of(run) >= _steps_of(other) else other
+            left_out = other if farther is run else run
+            print(f"left out: {left_out.path}: has the seed and settings of {farther.path}", file=sys.stderr)
+            run = farther
+        kept[seed] = run
+    return list(kept.values())
+
+
+def _steps_of(run: "Run") -> int:
+    """Of its training episodes; 0 if they cannot be read, which is told where they are wanted."""
+    try:
+        return int(run.episodes.steps[-1]) if run.episodes is not None and len(run.episodes.steps) else 0
+    except ValueError:
+        return 0
 
 
 def _default_output(options: PlotOptions, groups: "list[Group]") -> Path:

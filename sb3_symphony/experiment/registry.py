@@ -68,7 +68,7 @@ def load_algorithm(name: str) -> type["BaseAlgorithm"]:
 
     :param name: a key of :data:`LOADABLE`, or ``FILE.py:Class``
     :return: its class
-    :raises ValueError: if the file has no such class
+    :raises ValueError: if the file cannot be imported or has no such class
     """
     if not is_file(name):
         module, class_name, _ = LOADABLE[name]
@@ -96,7 +96,9 @@ def _module_of(path: Path) -> ModuleType:
     sys.modules[path.stem] = module = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except BaseException:
+    except BaseException as error:
         del sys.modules[path.stem]
+        if isinstance(error, Exception):
+            raise ValueError(f"{path}: cannot be imported — {type(error).__name__}: {error}") from error
         raise
     return module

@@ -4,6 +4,7 @@ import json
 import sys
 import zipfile
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import get_latest_run_id
 from torch.utils.tensorboard import SummaryWriter
 
-from sb3_symphony.analysis.runs import noted_log, read_evaluations
+from sb3_symphony.analysis.runs import Evaluations, noted_log, read_evaluations
 from sb3_symphony.common.checkpoint import Checkpoint, checkpoint_files, newest_checkpoint
 from sb3_symphony.common.files import DamagedFile, write_atomically
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
@@ -55,13 +56,30 @@ class StoredRun:
         stop_reward = self.config.settings.stop_reward
         if stop_reward is None:
             return False
+        last = self.evaluations and (self.evaluations.steps[-1], self.evaluations.returns[-1].mean())
+        return bool(last and last[0] == self.steps and last[1] >= stop_reward)
+
+    @cached_property
+    def evaluations(self) -> Evaluations | None:
+        """Its evaluations, None if there are none or they are damaged."""
         try:
-            evaluations = read_evaluations(self.run.path)
-        except ValueError:  # damaged
-            return False
-        if evaluations is None:
-            return False
-        return bool(evaluations.returns[-1].mean() >= stop_reward and self.steps == evaluations.steps[-1])
+            return read_evaluations(self.run.path)
+        except ValueError:
+            return None
+
+    @property
+    def last_evaluation(self) -> list[float]:
+        """Returns of its last evaluation, empty if there is none."""
+        return [] if self.evaluations is None else [float(value) for value in self.evaluations.returns[-1]]
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time as its newest checkpoint has it, 0 if there is none."""
+        try:
+            checkpoint = newest_checkpoint(self.run.checkpoints)
+        except DamagedFile:
+            checkpoint = None
+        return 0.0 if checkpoint is None else checkpoint.state["elapsed"] / 1e9
 
     def checkpoint(self) -> Checkpoint | None:
         """

@@ -136,6 +136,9 @@ def _select(options: SelectOptions) -> Selection:
     if options.model is not None and options.exp_id != 0:
         raise ConfigError(f"--exp-id: {options.exp_id} — expected --model or --exp-id, not both")
 
+    if options.model is not None and options.folder != SelectOptions.model_fields["folder"].default:
+        raise ConfigError(f"-f: '{options.folder}' — expected --model or -f to look for runs, not both")
+
     run: RunFolder | None = None
     if options.model is not None:
         path = Path(options.model)
@@ -151,6 +154,8 @@ def _select(options: SelectOptions) -> Selection:
                 path = path.with_name(path.name + ".zip")
             run = _run_of(path)
     elif options.exp_id == -1:
+        if given:
+            raise ConfigError(f"{given[0]}: chooses among the models of a run — --exp-id -1 names one outside of runs")
         algo, env_id = options.algo or _DEFAULT_ALGO, options.env or _DEFAULT_ENV
         options = options.model_copy(update={"algo": algo, "env": env_id})
         path = Path(options.folder) / algo / f"{RunFolder.file_name(env_id)}.zip"
@@ -290,7 +295,7 @@ def _model_of(run: RunFolder, options: SelectOptions) -> Path:
 class EvaluateOptions(SelectOptions):
     """Options of ``sb3-symphony evaluate``; their meaning is in its ``--help``."""
 
-    n_episodes: int = Field(default=100, ge=1)
+    n_episodes: int = Field(default=100, ge=1, lt=2**31)
     seed: int = Field(default=20_000, ge=0, lt=2**31)
     deterministic: bool = True
     n_envs: int = Field(default=1, ge=1)
@@ -355,7 +360,7 @@ class VideoOptions(AgentsOptions):
 class GaitOptions(AgentsOptions):
     """Options of ``sb3-symphony gait``; their meaning is in its ``--help``."""
 
-    skip: FiniteFloat = Field(default=2.0, ge=0)
-    window: FiniteFloat = Field(default=2.0, ge=0.2)
+    skip: FiniteFloat = Field(default=2.0, ge=0, le=1e6)
+    window: FiniteFloat = Field(default=2.0, ge=0.2, le=1e6)
     n_frames: int = Field(default=8, ge=0, le=40)
     json_file: str | None = None

@@ -485,9 +485,9 @@ def _only(study: Study, names: Sequence[str]) -> Study:
 
 
 def _check_twice(key: str, values: Sequence[Any]) -> None:
-    value, count = Counter(values).most_common(1)[0]
-    if count > 1:
-        raise ConfigError(f"{key}: {value!r} is there {count} times — expected every cell once")
+    for value, count in Counter(values).most_common(1):
+        if count > 1:
+            raise ConfigError(f"{key}: {value!r} is there {count} times — expected every cell once")
 
 
 def _chosen(key: str, wanted: Iterable[str] | None, there: Mapping[str, Any]) -> list[Any]:

@@ -353,7 +353,8 @@ def train(options: TrainOptions, command: str | None = None, folder: Path | None
             return _train(options, effective_config(options), command, cleanup, folder=folder)
         stored = open_run(options)
         if stored.finished:
-            return TrainResult(stored.run, stored.steps, [], 0.0, untouched=True, solved=stored.solved)
+            last, seconds = stored.last_evaluation, stored.seconds
+            return TrainResult(stored.run, stored.steps, last, seconds, untouched=True, solved=stored.solved)
         for written in (stored.run.path, stored.run.checkpoints):
             check_folder(written, "--resume")
         cleanup.enter_context(_alone(stored.run))

@@ -30,7 +30,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.callbacks import StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, check_algorithm, load_config, merge
-from sb3_symphony.experiment.output import output_folder
+from sb3_symphony.experiment.output import check_folder, output_folder
 from sb3_symphony.experiment.space import SearchSpace, TuneOptions, read_space
 from sb3_symphony.experiment.sweep_report import ENDED, PLAN, REASON, RETURNS, SweepReport, best_of, parameters_of, replaced
 from sb3_symphony.experiment.sweep_storage import WORKER, StorageAway, SweepStorage, open_storage
@@ -481,6 +481,7 @@ def _tune(options: TuneOptions) -> TuneResult:
         if stop.requested:
             raise KeyboardInterrupt
 
+    check_folder(options.folder, "--log-folder")
     storage = open_storage(options.where, stopping, options.heartbeat)
     try:
         study = _open_study(plan, storage)

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,9 +23,10 @@ from PIL import Image, ImageDraw, ImageFont
 from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
 from stable_baselines3.common.env_util import unwrap_wrapper
 
+from sb3_symphony.analysis.runs import named_apart
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError, told
-from sb3_symphony.experiment.output import output_file, output_folder, progress_bar
+from sb3_symphony.experiment.output import check_folder, output_file, progress_bar
 from sb3_symphony.experiment.run_folder import RunFolder, steps_in_name
 from sb3_symphony.experiment.select import AgentsOptions, Selection, SelectOptions, VideoOptions
 
@@ -115,14 +117,7 @@ def _labels(selections: Sequence[Selection]) -> list[str]:
         if len({other.env_id for other in selections}) > 1:
             label += f" on {selection.env_id}"
         labels.append(label)
-    if len(set(labels)) == len(labels):
-        return labels
-    paths = [(selection.run or selection.model.with_suffix("")).absolute().parts for selection in selections]
-    for depth in range(1, max(map(len, paths))):  # as little of the paths as tells them apart
-        named = [f"{label} ({'/'.join(path[-depth:])})" for label, path in zip(labels, paths, strict=True)]
-        if len(set(named)) == len(named):
-            return named
-    return labels  # one agent several times
+    return named_apart(labels, [selection.run or selection.model.with_suffix("") for selection in selections])
 
 
 @contextmanager
@@ -363,7 +358,7 @@ def _default_output(options: VideoOptions, agents: Sequence[Shown]) -> Path:
         return Path(f"{RunFolder.file_name(selection.env_id)}_grid.mp4")
     if selection.run is None or selection.shipped:
         return selection.beside(".mp4")
-    return output_folder(selection.run / "videos", "--output") / f"{selection.model.stem}.mp4"
+    return selection.run / "videos" / f"{selection.model.stem}.mp4"  # a folder that may have to be made
 
 
 def video(options: VideoOptions) -> list[Path]:
@@ -381,7 +376,11 @@ def video(options: VideoOptions) -> list[Path]:
             raise ConfigError(f"--output: '{options.output}' — {len(films)} agents give {len(films)} files, see --grid")
         outputs: list[Path] = []
         for film in films:
-            output = output_file(options.output or _default_output(options, film), "--output", SUFFIXES)
+            if options.output is not None:
+                output = output_file(options.output, "--output", SUFFIXES)
+            else:
+                output = _default_output(options, film)
+                check_folder(output.parent, "--output")
             if output.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
                 raise ConfigError(f'{output}: MP4 needs imageio-ffmpeg: pip install "sb3-symphony[video]" — or use .gif')
             if output in outputs:
@@ -401,7 +400,9 @@ def _film(agents: Sequence[Shown], options: VideoOptions, output: Path) -> Path:
     )
     try:
         with closing(pictures):  # the bar goes before an error is told
-            write_film(pictures, fps, output)
+            first = next(pictures)  # before anything is written
+            output.parent.mkdir(exist_ok=True)
+            write_film(chain([first], pictures), fps, output)
     except OSError as error:
         raise ConfigError(f"--output: '{output}' cannot be written — {error.strerror or error}") from None
     return output

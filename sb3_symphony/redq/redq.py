@@ -56,7 +56,8 @@ class REDQ(EnsembleOffPolicyAlgorithm):
     :param critic_loss: Error function of the critics: ``"mse"``, ``"huber"``, ``"rehe"`` or ``"rehe_elementwise"``;
         ``"hl_gauss"`` for critics that classify, which need ``policy_kwargs`` with a ``value_range``
     :param critic_reduction: ``"independent"``: every critic fits the target; ``"ensemble_mean"``: their mean does
-    :param ent_coef: Entropy regularization coefficient. ``"auto"`` learns it (``"auto_0.1"``: starting from 0.1)
+    :param ent_coef: Entropy regularization coefficient. ``"auto"`` learns it (``"auto_0.1"``: starting from 0.1;
+        a loaded model goes on from what it had learned)
     :param target_entropy: Target entropy when learning ``ent_coef``: a number, ``"auto"`` (minus the action dimension) or
         ``"mbpo"`` (the table the authors use for MuJoCo environments)
     :param use_sde: Whether to use generalized State Dependent Exploration (gSDE)
@@ -164,7 +165,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         check_number("batch_size", self.batch_size, 1, integer=True)
         if self.subset_size != "all":
             check_number("subset_size", self.subset_size, 1)
-            if float(self.subset_size) > self.n_critics:
+            if self.target_mode == "min" and float(self.subset_size) > self.n_critics:
                 raise ValueError(f"subset_size={self.subset_size!r}: expected at most n_critics={self.n_critics}")
 
     def _setup_model(self) -> None:
