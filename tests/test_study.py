@@ -1,5 +1,8 @@
 """Study files: what their cells are, and one clear line for every mistake."""
 
+import math
+import re
+import runpy
 import shutil
 from pathlib import Path
 
@@ -328,6 +331,26 @@ def test_pages_are_made_from_the_raw_files(path, tmp_path):
     page.write_text(written, encoding="utf-8")
     assert main(["bench", str(path), "--report", "-f", str(results), "--page", str(page)]) == 0
     assert page.read_text(encoding="utf-8") == written
+
+
+def test_rows_of_the_ablation_are_made_from_the_raw_files():
+    folder = BENCHMARKS / "studies" / "bipedalwalker"
+    table = runpy.run_path(str(folder / "rows.py"))["table"]()
+    page = (folder / "ablation.md").read_text(encoding="utf-8")
+    assert re.findall("<!-- rows -->\n\n(.*?)\n\n<!-- /rows -->", page, re.DOTALL) == [table]
+
+
+@pytest.mark.parametrize(
+    "runs, others, expected",
+    [
+        ([4, 5], [1, 2, 3], "late, 10%"),  # 1 of 10 draws
+        ([1, 3], [2, 4, 5], "early, 20%"),
+        ([math.inf], [1, math.inf, 2], "late, 50%"),  # the last two share a rank
+    ],
+)
+def test_chance_of_ranks(runs, others, expected):
+    chance = runpy.run_path(str(BENCHMARKS / "studies" / "bipedalwalker" / "rows.py"))["chance"]
+    assert chance(runs, others) == expected
 
 
 def test_a_page_needs_its_marks(write, tmp_path, capsys):
