@@ -172,7 +172,7 @@ def q_bias(
     :param model: SAC, TD3, DDPG, TQC, CrossQ, Symphony, REDQ, DroQ or a class derived from them
     :param env: environment of its own, with the rewards that are learned from (so with wrappers that transform them) and,
         if the model has it, ``VecNormalize``, whose ``training`` is set to False and whose statistics are copied from training
-        (of a model that was loaded without its environment: are what they are)
+        (if the model was loaded without its environment they have to be those of training already)
     :param n_pairs: number of pairs after which no further episode is begun
     :param max_episode_steps: number of pairs kept of each episode
     :param seed: seed of environment and actions, so that a model is always measured on the same draws
