@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sb3_symphony.analysis.runs import read_evaluations
+
 RESULTS = Path(__file__).parents[2] / "results"
 SHIPPED = [("bipedalwalker", "symphony"), ("bipedalwalker_fresh", "symphony"), ("bipedalwalker_ablation", "shipped")]
 STEPS = 40_000
@@ -43,8 +45,9 @@ def _reached(cell: dict[str, str], what: str, value: str) -> float:
 
 def _falls(run: Path) -> tuple[int, int]:
     """Evaluation episodes below 200 from the first evaluation of 200 on, and all of them."""
-    with np.load(run / "evaluations.npz") as data:
-        returns = data["results"][data["timesteps"] <= STEPS]
+    evaluations = read_evaluations(run)
+    assert evaluations is not None  # the run is done
+    returns = evaluations.returns[evaluations.steps <= STEPS]
     walking = returns[np.cumsum(returns.mean(axis=1) >= 200) > 0]
     return int((walking < 200).sum()), walking.size
 
