@@ -328,7 +328,7 @@ def test_disk_that_fills_up(small_disk, whole, folder, capsys):
     study = write_study(folder, algorithms=STUDY["algorithms"][:1], seeds=1)
     results, filler = small_disk / "results", small_disk / "filler"
     command = ["bench", str(study), "-j", "1", "-f", str(results)]
-    results.mkdir()
+    (results / "settings").mkdir(parents=True)  # which results have, unlike other folders with a study.yml
     (results / "study.yml").write_text("an earlier one")
     with filler.open("wb", buffering=0) as file, suppress(OSError):
         while file.write(bytes(1024)):
