@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch as th
 import yaml
+from maths_helpers import assert_same_weights, separate_networks
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
@@ -234,8 +236,8 @@ CONTROLS = STUDIES / "bipedalwalker" / "controls.py"
 @pytest.mark.parametrize(
     ("control", "ours", "own"),
     [
-        ("td3", "symphony", ["learning_rate", "tau", "n_timesteps", "saturation_penalty"]),
-        ("sac", "droq", ["n_timesteps", "ent_coef", "target_entropy"]),
+        ("td3", "symphony", ["learning_rate", "critic_learning_rate", "tau", "target_policy_noise", "saturation_penalty"]),
+        ("sac", "droq", ["ent_coef", "target_entropy", "replay_buffer_class", "replay_buffer_kwargs", "layer_norm"]),
     ],
 )
 def test_controls_are_given_what_ours_are_given(control, ours, own):
@@ -243,45 +245,87 @@ def test_controls_are_given_what_ours_are_given(control, ours, own):
     ours = yaml.safe_load((STUDIES.parents[1] / "hyperparams" / f"{ours}.yml").read_text())["BipedalWalker-v3"]
     theirs.update(theirs["policy_kwargs"])
     ours.update(ours["policy_kwargs"])
-    common = ["env_wrapper", "learning_starts", "batch_size", "gradient_steps", "net_arch", "actor_averaging"]
-    common += ["action_noise", "callback"]
+    common = ["env_wrapper", "learning_starts", "batch_size", "n_steps", "gradient_steps", "net_arch", "actor_averaging"]
+    common += ["action_noise", "callback", "n_timesteps"]
     for key in [*common, *own]:
         assert theirs.get(key) == ours.get(key), key
-    assert theirs["replay_buffer_kwargs"]["n_steps"] == ours["n_steps"]  # SB3's own argument reaches no buffer but its own
     assert theirs["replay_buffer_kwargs"]["mirror"] == ours["replay_buffer_kwargs"]["mirror"]
 
 
-def test_saturation_penalty_of_the_control():
-    """The same step of the actor as with its loss written out."""
-    gradients = []
-    for penalty in (0.0, 0.3):
-        policy_kwargs = dict(net_arch=[8, 8], saturation_penalty=penalty, actor_averaging=0.5)
-        model = load_algorithm(f"{CONTROLS}:LayerNormTD3")("MlpPolicy", "Pendulum-v1", seed=0, policy_kwargs=policy_kwargs)
-        observations = batch_of(model).observations
-        with th.no_grad():
-            model.actor.mu[-2].weight *= 30
-        actions = model.actor(observations)
-        loss = -model.critic.q1_forward(observations, actions).mean()
-        gradients.append(th.autograd.grad(loss, list(model.actor.parameters())))
-    excess = (model.actor.mu[:-1](observations).abs() - 1.5).clamp(min=0)
-    own = th.autograd.grad(0.3 * (excess**2).sum(dim=1).mean(), list(model.actor.parameters()))
-    # the hook answers this pass, too, with its part once more
-    for without, with_it, twice in zip(*gradients, own, strict=True):
-        th.testing.assert_close(with_it - without, twice / 2, rtol=1e-4, atol=1e-6)
-        assert twice.abs().max() > 1e-3
+def theirs_with_weights_of(ours, theirs):
+    """Stable-Baselines3's model with layer normalisation in the critics, and all weights of ours."""
+    for own, critic in ((ours.critic, theirs.critic), (ours.critic_target, theirs.critic_target)):
+        critic.q_networks = separate_networks(own.q_networks)
+        for i, network in enumerate(critic.q_networks):
+            setattr(critic, f"qf{i}", network)
+    theirs.critic.optimizer = th.optim.Adam(theirs.critic.parameters(), lr=theirs.learning_rate)
+    theirs.actor.load_state_dict(ours.actor.state_dict())
+    return theirs
 
 
-@pytest.mark.parametrize("name", ["LayerNormTD3", "LayerNormSAC"])
-def test_controls_live(name, tmp_path):
-    model = load_algorithm(f"{CONTROLS}:{name}")(
-        "MlpPolicy", "Pendulum-v1", seed=0, learning_starts=30, policy_kwargs=dict(net_arch=[8, 8], actor_averaging=0.5)
+@pytest.mark.parametrize(("name", "cls"), [("TD3Control", TD3), ("SACControl", SAC)])
+def test_controls_are_those_of_stable_baselines3(name, cls, monkeypatch):
+    """Twelve updates, in two calls: the same weights."""
+    common = dict(learning_rate=3e-2, tau=0.3, batch_size=12, seed=0, buffer_size=50)
+    delay = {"policy_delay": 2} if cls is TD3 else {}
+    theirs = cls("MlpPolicy", "Pendulum-v1", **common, **delay, policy_kwargs=dict(net_arch=[8, 8]))
+    if cls is TD3:
+        given = dict(critic_learning_rate=3e-2, critic_loss="mse", actor_loss="mean", target_policy_noise=0.2)
+        given.update(policy_delay=2, initial_gradient_steps=(0, 0), episode_gradient_steps=0)
+        policy_kwargs = dict(activation_fn=nn.ReLU, layer_norm={"pi": False, "qf": True})
+    else:
+        given, policy_kwargs = dict(policy_delay=1, n_critics=2, subset_size="all"), dict(layer_norm=True)
+    ours = load_algorithm(f"{CONTROLS}:{name}")(
+        "MlpPolicy", "Pendulum-v1", **common, **given, policy_kwargs=dict(net_arch=[8, 8], **policy_kwargs)
     )
+    theirs_with_weights_of(ours, theirs)
+    if cls is TD3:
+        theirs.actor_target.load_state_dict(ours.policy.actor_target.state_dict())
+    batch = batch_of(ours)
+
+    def sample(n, env=None):
+        rows = th.arange(n) % 12
+        return ReplayBufferSamples(*(None if field is None else field[rows] for field in batch))
+
+    def always(shape):
+        return th.linspace(-2, 2, 12).reshape(-1, 1).repeat(shape[0] // 12, 1)
+
+    # Draws come in another order, so all are alike
+    monkeypatch.setattr(th, "randn_like", lambda x: always(x.shape))
+    monkeypatch.setattr(th.Tensor, "normal_", lambda x, mean, std: x.copy_(std * always(x.shape)))
+    monkeypatch.setattr("torch.distributions.normal._standard_normal", lambda shape, **kwargs: always(shape))
+    for model in (ours, theirs):
+        monkeypatch.setattr(model.replay_buffer, "sample", sample)
+        model._setup_learn(1, None)
+        model.train(3, 12)
+        model.train(9, 12)
+    for own, critic in ((ours.critic, theirs.critic), (ours.critic_target, theirs.critic_target)):
+        assert_same_weights(own.q_networks, critic.q_networks, 1e-4)
+    actors = [(ours.actor, theirs.actor)]
+    actors += [(ours.policy.actor_target, theirs.actor_target)] if cls is TD3 else []
+    for own, other in actors:
+        for a, b in zip(own.parameters(), other.parameters(), strict=True):
+            th.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+    if cls is SAC:
+        th.testing.assert_close(ours.log_ent_coef, theirs.log_ent_coef)
+
+
+@pytest.mark.parametrize("name", ["TD3Control", "SACControl"])
+def test_controls_live(name, tmp_path):
+    ours = load_algorithm(f"{CONTROLS}:{name}")
+    model = ours(
+        *("MlpPolicy", "Pendulum-v1"),
+        learning_starts=30,
+        policy_delay=1,
+        seed=0,
+        policy_kwargs=dict(net_arch=[8, 8], actor_averaging=0.5),
+    )
+    before = [parameter.detach().clone() for parameter in model.policy.parameters()]
     model.learn(60)
     assert model.policy.n_averaged == model._n_updates
-    for network in (model.critic.qf0, model.critic.qf1, model.critic_target.qf0):
-        assert [type(layer) for layer in network].count(nn.LayerNorm) == 2
+    assert not any(th.equal(old, new) for old, new in zip(before, model.policy.parameters(), strict=True))
     model.save(tmp_path / "model")
-    loaded = load_algorithm(f"{CONTROLS}:{name}").load(tmp_path / "model")
+    loaded = ours.load(tmp_path / "model")
     for key, value in model.policy.state_dict().items():
         assert th.equal(value, loaded.policy.state_dict()[key]), key
 

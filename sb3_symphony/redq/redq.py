@@ -248,12 +248,13 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             self.policy.average_actor()
 
     def _update_actor(self, batch: ReplayBufferSamples, ent_coef: th.Tensor, logs: UpdateLogs) -> None:
-        """One step of the actor toward the mean of all critics, then one of the entropy coefficient."""
+        """One step of the actor, then one of the entropy coefficient."""
         if self.use_sde:
             self.actor.reset_noise()
         actions, log_prob = self.actor.action_log_prob(batch.observations)
         log_prob = log_prob.reshape(-1, 1)
-        actor_loss = (ent_coef * log_prob - self._regression.q_values(batch.observations, actions).mean(dim=0)).mean()
+        q_values = self._actor_values(self._regression.q_values(batch.observations, actions))
+        actor_loss = (ent_coef * log_prob - q_values).mean()
         self._step_actor(actor_loss)
         logs["actor_loss"].append(actor_loss.detach())
         logs["ent_coef"].append(ent_coef.mean())
@@ -264,6 +265,10 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             ent_coef_loss.backward()
             self.ent_coef_optimizer.step()
             logs["ent_coef_loss"].append(ent_coef_loss.detach())
+
+    def _actor_values(self, q_values: th.Tensor) -> th.Tensor:
+        """What the actor goes toward: the mean of all critics, ``(n_critics, batch, 1) -> (batch, 1)``."""
+        return q_values.mean(dim=0)
 
     def _current_ent_coef(self) -> th.Tensor:
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef.detach().exp()

@@ -264,10 +264,9 @@ class Symphony(EnsembleOffPolicyAlgorithm):
             self.policy.average_actor()
 
     def _update_actor(self, batch: ReplayBufferSamples, logs: UpdateLogs) -> None:
-        """One step of the actor toward the combined critics."""
+        """One step of the actor."""
         before_tanh = self.actor.before_tanh(batch.observations)  # (batch, n_actions)
-        q_values = self._regression.q_values(batch.observations, th.tanh(before_tanh))
-        q_values = combine(q_values, self.target_mode, self.actor_mix)
+        q_values = self._actor_values(self._regression.q_values(batch.observations, th.tanh(before_tanh)))
         actor_loss = -ACTOR_LOSSES[self.actor_loss](q_values, self.baseline)
         if self.saturation_penalty > 0:
             excess = F.relu(before_tanh.abs() - SATURATED)  # (batch, n_actions)
@@ -278,6 +277,10 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         logs["actor_loss"].append(actor_loss.detach())
         logs["advantage"].append(value - self.baseline)
         self.baseline.copy_(value)
+
+    def _actor_values(self, q_values: th.Tensor) -> th.Tensor:
+        """What the actor goes toward: the critics combined, ``(n_critics, batch, 1) -> (batch, 1)``."""
+        return combine(q_values, self.target_mode, self.actor_mix)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

@@ -1,95 +1,69 @@
 """
-Fair controls: Stable-Baselines3's TD3 and SAC with what they have no option for: layer normalisation in the critics, and
-evaluations that ask an average of the actor; TD3 also with a penalty on saturated actions, which SAC's entropy contains. All
-else that ours are given (n-step returns, update ratio, cut rewards, noise, sizes) they take as arguments, see td3.yml and
-sac.yml. Names for ``algo``: ``controls.py:LayerNormTD3`` and ``controls.py:LayerNormSAC``.
+Fair controls: TD3 and SAC as Stable-Baselines3 computes them, with the update engine, layer normalisation, averaged actor and
+whatever else ours are given, see td3.yml and sac.yml. With 20 updates for each step, by Stable-Baselines3's own classes one
+run of SAC would take seven hours. Names for ``algo``: ``controls.py:TD3Control`` and ``controls.py:SACControl``.
 """
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch as th
-from stable_baselines3 import SAC, TD3
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
-from stable_baselines3.sac.policies import SACPolicy
-from stable_baselines3.td3.policies import Actor, TD3Policy
-from torch import nn
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import polyak_update
 
-from sb3_symphony.common.averaging import AveragedActor
-from sb3_symphony.symphony.symphony import SATURATED
+from sb3_symphony import REDQ, Symphony
+from sb3_symphony.common.off_policy import UpdateLogs
+from sb3_symphony.symphony.policies import Actor, SymphonyPolicy
 
 
-def _normalized(critic: ContinuousCritic, net_arch: list[int], activation_fn: type[nn.Module]) -> ContinuousCritic:
-    """The critic with new networks: linear → layer normalisation → activation."""
-    input_dim = critic.q_networks[0][0].in_features
-    critic.q_networks = []
-    for i in range(critic.n_critics):
-        layers = create_mlp(input_dim, 1, net_arch, activation_fn, post_linear_modules=[nn.LayerNorm])
-        setattr(critic, f"qf{i}", network := nn.Sequential(*layers).to(critic.device))
-        critic.q_networks.append(network)
-    return critic
+class TD3ControlPolicy(SymphonyPolicy):
+    """Symphony's policy with a target for the actor."""
+
+    actor_target: Actor
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.actor_target = self.make_actor()
+        self.actor_target.load_state_dict(self.actor.state_dict())
+        self.actor_target.set_training_mode(False)
 
 
-class _Averaged(AveragedActor):
-    """The averaged actor as a keyword argument of SB3's policies."""
+class TD3Control(Symphony):
+    """TD3: the actor has a target and follows the first critic; all targets move when it does."""
 
-    def __init__(self, *args: Any, actor_averaging: float = 0.0, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.start_average(actor_averaging)
+    policy: TD3ControlPolicy
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": TD3ControlPolicy}
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "actor_averaging": self.actor_averaging}
+    def _learn_from(self, segment: ReplayBufferSamples, batches: list[ReplayBufferSamples], logs: UpdateLogs) -> None:
+        with th.no_grad():
+            next_actions = self.policy.actor_target(segment.next_observations)
+            noise = self.target_policy_noise * th.randn_like(next_actions).clamp(-2.5, 2.5)
+            next_actions = (next_actions + noise).clamp(-1, 1)
 
+        for batch, next_action in zip(batches, next_actions.chunk(len(batches)), strict=True):
+            with th.no_grad():
+                next_q_values = self._regression.target_q_values(batch.next_observations, next_action)
+                target = batch.rewards + (1 - batch.dones) * self._discounts(batch) * next_q_values.min(dim=0).values
+            self._fit_critics(batch, target, logs)
 
-class LayerNormTD3Policy(_Averaged, TD3Policy):
-    """TD3's policy with such critics."""
+        if self._n_updates % self.policy_delay == 0:
+            self._update_actor(batches[-1], logs)
+            polyak_update(self.actor.parameters(), self.policy.actor_target.parameters(), self.tau)
+            self.policy.average_actor()
 
-    def __init__(self, *args: Any, saturation_penalty: float = 0.0, **kwargs: Any) -> None:
-        self.saturation_penalty = saturation_penalty
-        super().__init__(*args, **kwargs)
+    def _fit_critics(self, batch: ReplayBufferSamples, target: th.Tensor, logs: UpdateLogs) -> None:
+        tau, self.tau = self.tau, self.tau if (self._n_updates + 1) % self.policy_delay == 0 else 0.0
+        super()._fit_critics(batch, target, logs)
+        self.tau = tau
 
-    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
-        actor = super().make_actor(features_extractor)
-
-        def penalise(module: nn.Module, inputs: tuple[th.Tensor, ...], before_tanh: th.Tensor) -> None:
-            """Symphony's ``saturation_penalty``, added to the gradient, as TD3 makes its loss in the middle of ``train``."""
-            if before_tanh.requires_grad:
-                before = before_tanh.detach()
-                slope = 2 * (before - before.clamp(-SATURATED, SATURATED)) / len(before)  # of the mean of the squared excess
-                before_tanh.register_hook(lambda gradient: gradient + self.saturation_penalty * slope)
-
-        actor.mu[-2].register_forward_hook(penalise)
-        return actor
-
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        return _normalized(super().make_critic(features_extractor), self.critic_kwargs["net_arch"], self.activation_fn)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), "saturation_penalty": self.saturation_penalty}
+    def _actor_values(self, q_values: th.Tensor) -> th.Tensor:
+        return q_values[0]
 
 
-class LayerNormSACPolicy(_Averaged, SACPolicy):
-    """SAC's policy with such critics."""
+class SACControl(REDQ):
+    """SAC: REDQ with all critics in the target, whose actor follows their minimum."""
 
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        return _normalized(super().make_critic(features_extractor), self.critic_kwargs["net_arch"], self.activation_fn)
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = REDQ.policy_aliases
 
-
-class LayerNormTD3(TD3):
-    """TD3 with layer normalisation in the critics, a penalty on saturated actions and an averaged actor."""
-
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": LayerNormTD3Policy}
-
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        super().train(gradient_steps, batch_size)
-        self.policy.average_actor()
-
-
-class LayerNormSAC(SAC):
-    """SAC with layer normalisation in the critics and an averaged actor."""
-
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": LayerNormSACPolicy}
-
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        super().train(gradient_steps, batch_size)
-        self.policy.average_actor()
+    def _actor_values(self, q_values: th.Tensor) -> th.Tensor:
+        return q_values.min(dim=0).values
