@@ -30,7 +30,7 @@ ROLLOUT = {"rollout/ep_rew_mean", "rollout/ep_len_mean"}
 TRAIN = {f"train/{key}" for key in ("learning_rate", "n_updates", "actor_loss", "critic_loss")}
 OURS = {f"train/{key}" for key in ("q_mean", "q_std", "target_q_mean", "update_ratio", "noise_std")}
 OWN = {
-    Symphony: {"train/advantage"},
+    Symphony: {"train/actor_value", "train/advantage", "train/batch_size"},
     REDQ: {"train/ent_coef", "train/ent_coef_loss"},
     DroQ: {"train/ent_coef", "train/ent_coef_loss"},
 }
@@ -122,6 +122,14 @@ def test_logged_values(make):
     for index, key in enumerate(("critic_loss", "q_mean", "target_q_mean")):
         assert logged[f"train/{key}"] == pytest.approx(np.mean([each[index] for each in losses]), rel=1e-5)
     assert len(losses) == 5 and logged["train/n_updates"] == model._n_updates
+
+
+def test_no_update_is_no_error(make):
+    """As SB3's own take it."""
+    model = make().learn(60)
+    n_updates = model._n_updates
+    model.train(0, 16)
+    assert model._n_updates == n_updates
 
 
 def test_no_actor_loss_without_actor_update(make):

@@ -185,7 +185,7 @@ def test_a_recording_is_not_used_once_something_it_depends_on_changes(small):
     ],
 )
 def test_what_happens_in_python_is_not_recorded(small, spoil):
-    model = small(Symphony, **SETTINGS)
+    model = small(Symphony, **SETTINGS).learn(60)
     optimizers = [model.actor.optimizer, model.critic.optimizer]
     assert recorded_state(model.policy, optimizers) is not None
     spoil(model)
@@ -198,6 +198,21 @@ def test_other_optimizers_are_not_recorded(small):
     assert recorded_state(model.policy, [model.actor.optimizer, model.critic.optimizer]) is None
 
 
+def test_nothing_is_recorded_before_optimizers_have_states(small):
+    """Which the first step makes: replays of a recording of it would go on with states that nobody has any more."""
+    model = small(Symphony, **SETTINGS)
+    optimizers = [model.actor.optimizer, model.critic.optimizer]
+    untrained = copy.deepcopy(model.get_parameters())
+    assert recorded_state(model.policy, optimizers) is None
+    model.learn(60)
+    assert recorded_state(model.policy, optimizers) is not None
+    model.set_parameters(untrained)
+    assert recorded_state(model.policy, optimizers) is None
+    model.actor.requires_grad_(False)  # what is frozen needs none
+    model.learn(60)
+    assert not model.actor.optimizer.state and recorded_state(model.policy, optimizers) is not None
+
+
 def test_nothing_is_recorded_on_the_cpu(small):
     model = small(Symphony).learn(60)
     assert model._recorded_state() is None and not model._recordings._recordings
@@ -208,7 +223,7 @@ def test_only_our_own_updates_are_recorded(small):
         pass
 
     def state(cls=Symphony, **kwargs):
-        model = small(cls, **kwargs)
+        model = small(cls, **kwargs).learn(60)
         model.device = th.device("cuda")  # its networks are not looked at
         return model, model._recorded_state()
 

@@ -153,6 +153,17 @@ def test_optimizers(optimizer, optimizer_kwargs):
     assert_equal_runs(*pair(optimizer=optimizer, optimizer_kwargs=optimizer_kwargs))
 
 
+@pytest.mark.parametrize("beta2", [0.999, 0.99999])
+def test_second_moments_in_single_precision(beta2):
+    """As exact as torch's, however close to 1 their decay is."""
+    sums = []
+    for engine, dtype in (("fused", th.float32), ("autograd", th.float64)):
+        fitter = regression(engine, dtype=dtype, optimizer_kwargs=dict(betas=(0.9, beta2)))
+        run(fitter, updates=3, dtype=dtype)
+        sums.append(sum(each["exp_avg_sq"].double().sum().item() for each in fitter.critic.optimizer.state.values()))
+    assert sums[0] == pytest.approx(sums[1], rel=1e-5)
+
+
 @pytest.mark.skipif("decoupled_weight_decay" not in inspect.signature(th.optim.Adam).parameters, reason="an older torch")
 def test_decoupled_weight_decay_of_adam():
     assert_equal_runs(*pair(optimizer_kwargs=dict(weight_decay=0.5, decoupled_weight_decay=True)))

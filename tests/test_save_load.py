@@ -14,6 +14,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecFrameStack
 
 from sb3_symphony import REDQ, DroQ, Symphony
 from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
@@ -379,12 +380,14 @@ def test_set_env(make, pendulum):
     assert model._last_obs is not None
 
 
-@pytest.mark.parametrize("reset", [True, False])
-def test_returns_end_where_an_episode_is_given_up(make, pendulum, reset):
+@pytest.mark.parametrize(("reset", "n_stack"), [(True, 1), (True, 2), (False, 1)])
+def test_returns_end_where_an_episode_is_given_up(make, pendulum, reset, n_stack):
     """The environment is reset in the middle of an episode: three-step returns must not reach into the next one."""
-    model = make(n_steps=3, gamma=0.5).learn(60)  # episodes of 25 steps
+    env = VecFrameStack(pendulum(), n_stack)  # resets into the array that its last step returned
+    model = make(env, n_steps=3, gamma=0.5).learn(60)  # episodes of 25 steps
     model.learn(10, reset_num_timesteps=False)  # goes on in its episode
-    model.set_env(pendulum(), force_reset=not reset)
+    if not reset:
+        model.set_env(pendulum())
     model.learn(20, reset_num_timesteps=reset)
     samples = model.replay_buffer._get_samples(np.arange(90))
     lengths = np.log(samples.discounts.flatten().numpy()) / np.log(0.5)

@@ -237,7 +237,7 @@ CONTROLS = STUDIES / "bipedalwalker" / "controls.py"
     ("control", "ours", "own"),
     [
         ("td3", "symphony", ["learning_rate", "critic_learning_rate", "tau", "target_policy_noise", "saturation_penalty"]),
-        ("sac", "droq", ["ent_coef", "target_entropy", "replay_buffer_class", "replay_buffer_kwargs", "layer_norm"]),
+        ("sac", "droq", ["learning_rate", "policy_delay", "ent_coef", "target_entropy", "replay_buffer_kwargs", "layer_norm"]),
     ],
 )
 def test_controls_are_given_what_ours_are_given(control, ours, own):

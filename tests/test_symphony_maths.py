@@ -12,6 +12,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 from torch import nn
 
 from sb3_symphony import Symphony
+from sb3_symphony.common.off_policy import update_logs
 
 GAMMA, TAU = 0.97, 0.01
 
@@ -232,7 +233,7 @@ def test_baseline_is_the_last_mean_value():
         before = model.baseline.item()
         with th.no_grad():
             value = model.critic(batch.observations, model.actor(batch.observations)).amin(dim=0).mean().item()
-        logs = {"actor_loss": [], "advantage": []}
+        logs = update_logs()
         model._update_actor(batch, logs)
         assert model.baseline.item() == pytest.approx(value, abs=1e-6)
         advantage = value - before
@@ -244,7 +245,7 @@ def test_a_batch_seen_twice_has_no_gradient():
     model, _ = model_with_data()
     model.actor.optimizer.param_groups[0]["lr"] = 0.0
     batch = model.replay_buffer.sample(32)
-    logs = {"actor_loss": [], "advantage": []}
+    logs = update_logs()
     model._update_actor(batch, logs)
     assert any(parameter.grad.any() for parameter in model.actor.parameters())
     model._update_actor(batch, logs)
@@ -262,7 +263,7 @@ def test_the_actor_gradient_is_the_policy_gradient_times_one_factor(monkeypatch)
     plain = th.autograd.grad(q_values.mean(), list(model.actor.parameters()))
     distance = q_values.mean().item() - 0.4
     factor = math.tanh(abs(distance)) + abs(distance) / math.cosh(distance) ** 2
-    model._update_actor(batch, {"actor_loss": [], "advantage": []})
+    model._update_actor(batch, update_logs())
     for parameter, gradient in zip(model.actor.parameters(), plain, strict=True):
         th.testing.assert_close(parameter.grad, -factor * gradient, rtol=1e-10, atol=1e-14)
 
@@ -517,7 +518,7 @@ def test_saturation_penalty(scale, shift, saturated):
             model.actor.mu[-2].bias += shift
         batch = model.replay_buffer.sample(32)
         actor = copy.deepcopy(model.actor)
-        model._update_actor(batch, {"actor_loss": [], "advantage": []})
+        model._update_actor(batch, update_logs())
         gradients.append([parameter.grad.double() for parameter in model.actor.parameters()])
     u = actor.before_tanh(batch.observations).double()
     assert saturated[0] <= (u.abs() > 1.5).double().mean() <= saturated[1]

@@ -49,7 +49,7 @@ class AveragedActor(BasePolicy):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """
-        Torch's. An actor that comes without an average starts a new one.
+        Torch's. An actor that comes without an average (which ``strict`` would refuse) starts a new one.
 
         :param state_dict: parameters by name
         :param strict: whether all have to be there, and no others

@@ -188,7 +188,7 @@ class _StepsReplayBuffer(NStepReplayBuffer):
         return ReplayBufferSamples(*fields)  # type: ignore[arg-type]  # only discounts may be None
 
 
-class _FadedSampling(ReplayBuffer):
+class FadedSampling(ReplayBuffer):
     """The rows drawn by both fading buffers; what a row holds is the business of the other base class."""
 
     def __init__(self, *args: Any, fade_factor: float | None = 7.0, fade_power: float = 2.0, **kwargs: Any) -> None:
@@ -223,7 +223,7 @@ class _FadedSampling(ReplayBuffer):
         return super().to_torch(array, copy=copy)
 
 
-class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
+class FadingReplayBuffer(FadedSampling, _StepsReplayBuffer):
     """
     Replay buffer that draws recent transitions more often: weight ∝ tanh(f·x^power), x = i/n with i = 0 the oldest.
 
@@ -327,7 +327,7 @@ class FadingReplayBuffer(_FadedSampling, _StepsReplayBuffer):
         return self._gather(rows, env_indices, env)
 
 
-class FadingDictReplayBuffer(_FadedSampling, DictReplayBuffer):
+class FadingDictReplayBuffer(FadedSampling, DictReplayBuffer):
     """
     :class:`FadingReplayBuffer` for Dict observations, without n-step returns (as in SB3).
 

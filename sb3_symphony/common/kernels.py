@@ -240,13 +240,13 @@ def adam_polyak(parameter, grad, exp_avg, exp_avg_sq, step, target, lr, beta1, b
     step[0] += 1
     rate = real(lr / (1 - beta1 ** step[0]))
     scale = real(1 / math.sqrt(1 - beta2 ** step[0]))
-    one, b1, b2, tau_, eps_ = real(1), real(1 - beta1), real(beta2), real(tau), real(eps)
+    b1, b2, c2, tau_, eps_ = real(1 - beta1), real(beta2), real(1 - beta2), real(tau), real(eps)
     decay, shrink = real(0 if decoupled else weight_decay), real(1 - lr * weight_decay if decoupled else 1)
     for j in range(parameter.size):
         p = parameter[j]
         g = grad[j] + decay * p
         m = exp_avg[j] + b1 * (g - exp_avg[j])
-        v = b2 * exp_avg_sq[j] + (one - b2) * g * g
+        v = b2 * exp_avg_sq[j] + c2 * g * g
         p = shrink * p - rate * m / (math.sqrt(v) * scale + eps_)
         exp_avg[j], exp_avg_sq[j], parameter[j] = m, v, p
         target[j] += tau_ * (p - target[j])

@@ -81,7 +81,7 @@ class DecayingActionNoise(ActionNoise):
 
     @property
     def std(self) -> float:
-        """Standard deviation of the next draw, over all episodes; NaN where it is not known."""
+        """Standard deviation of the next draw, over all episodes and before clipping; NaN where it is not known."""
         return self.sigma_t
 
     def __call__(self) -> np.ndarray:

@@ -18,13 +18,12 @@ from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, RolloutReturn, TrainFreq
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, RolloutReturn, TrainFreq
 from stable_baselines3.common.utils import get_parameters_by_name
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import (
-    FadingDictReplayBuffer,
-    FadingReplayBuffer,
+    FadedSampling,
     PrioritizedReplayBuffer,
     check_mirror,
     end_trajectory,
@@ -37,7 +36,6 @@ from sb3_symphony.common.recordings import Recordings, recorded_state
 from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
-FADING_BUFFERS = (FadingReplayBuffer, FadingDictReplayBuffer)
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
 
@@ -210,7 +208,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             self.replay_buffer_class = chosen = for_dict if is_dict else for_n_steps if n_steps > 1 else otherwise
         if is_dict and not issubclass(chosen, DictReplayBuffer):
             raise ValueError(f"replay_buffer_class={chosen.__name__}: expected one for Dict observations")
-        if "fade_factor" in given and not issubclass(chosen, FADING_BUFFERS):
+        if "fade_factor" in given and not issubclass(chosen, FadedSampling):
             raise ValueError(f"fade_factor={given['fade_factor']!r}: {chosen.__name__} does not fade")
         if issubclass(chosen, NStepReplayBuffer):
             own = {"n_steps": n_steps, "gamma": self.gamma}
@@ -246,7 +244,14 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self._create_regression()  # of these critics
         self._recordings = Recordings()
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> Any:
         assert self.env is not None, "You must set the environment before calling learn()"
         noise = self.action_noise
         if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.env.num_envs:
@@ -258,9 +263,9 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             if isinstance(each, DecayingActionNoise):
                 each.n_envs = self.env.num_envs  # a decay counts environment steps
         check_mirror(self.replay_buffer, self._vec_normalize_env)  # now, not after the warm-up
-        last_obs = self._last_obs
-        result = super()._setup_learn(*args, **kwargs)
-        if self._last_obs is not last_obs:
+        resets = reset_num_timesteps or self._last_obs is None  # as SB3 decides it; some return the same array again
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+        if resets:
             self.start_anew()
         self._timesteps_at_update = min(self._timesteps_at_update, self.num_timesteps)  # whose count may have restarted
         return result
@@ -412,13 +417,16 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _log_update(self, logs: UpdateLogs, noise_std: th.Tensor | float) -> None:
         """
-        Record the mean of each quantity over the updates of one ``train()`` call: the only transfer off the device; and the
-        ratio of updates to environment steps since the log was written.
+        Record the mean of each quantity over the updates of one ``train()`` call (the latest 1 000 of a long one): the only
+        transfer off the device; and the ratio of updates to environment steps since the log was written.
 
         :param logs: Log key (without ``train/``) to tensors of one shape, one per update. ``q_values``
             ``(n_critics, batch, 1)`` become ``q_mean`` and ``q_std``, the spread over the critics averaged over the batch
-        :param noise_std: Standard deviation of the exploration noise in [-1, 1] action units
+        :param noise_std: Standard deviation of the exploration noise in [-1, 1] action units; of a stochastic actor, that of
+            its Gaussian, before the tanh
         """
+        if not logs:
+            return
         means = {}
         for key, values in logs.items():
             stacked = th.stack(list(values))

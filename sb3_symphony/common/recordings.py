@@ -129,7 +129,7 @@ def recorded_state(policy: nn.Module, optimizers: Sequence[th.optim.Optimizer]) 
 
     :param policy: The module that has all networks
     :param optimizers: All that are stepped
-    :return: ``None`` if more happens than kernels (hooks), or something is not known to be recordable
+    :return: ``None`` if more happens than kernels (hooks, states that are made), or something is not known to be recordable
     """
     modules, parameters = list(policy.modules()), list(policy.parameters())
     if are_hooked(modules, parameters, optimizers):
@@ -139,6 +139,9 @@ def recorded_state(policy: nn.Module, optimizers: Sequence[th.optim.Optimizer]) 
     for optimizer in optimizers:
         if type(optimizer) not in (th.optim.Adam, th.optim.AdamW) or not all(g["fused"] for g in optimizer.param_groups):
             return None
+        trained = (each for group in optimizer.param_groups for each in group["params"] if each.requires_grad)
+        if any(each not in optimizer.state for each in trained):
+            return None  # its first step makes the state; a recording of that step would make another one, again and again
     states = [state for optimizer in optimizers for each in optimizer.state.values() for state in each.values()]
     tensors = [*parameters, *policy.buffers(), *states]
     apart = ("params", "lr", "initial_lr")

@@ -216,6 +216,8 @@ class REDQ(EnsembleOffPolicyAlgorithm):
             optimizers.append(self.ent_coef_optimizer)
         self._update_learning_rate(optimizers)
 
+        if gradient_steps == 0:
+            return
         logs = update_logs()
         self._update(gradient_steps, batch_size, logs)
 
@@ -223,7 +225,7 @@ class REDQ(EnsembleOffPolicyAlgorithm):
         self._log_update(logs, noise_std=action_dist.distribution.stddev.detach().mean())
         for name in ("distribution", "gaussian_actions", "_latent_sde"):
             if hasattr(action_dist, name):
-                setattr(action_dist, name, None)  # they hold the last graph, and a policy with one cannot be copied
+                setattr(action_dist, name, None)  # they hold the last graph, with which a policy cannot be copied
 
     def _learn_from(self, segment: ReplayBufferSamples, batches: list[ReplayBufferSamples], logs: UpdateLogs) -> None:
         # The actor and the temperature are frozen inside a segment: one forward pass gives all its next actions

@@ -11,13 +11,13 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
+from sb3_symphony.common.buffers import FadedSampling, FadingDictReplayBuffer, FadingReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number, check_pair
 from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
 from sb3_symphony.common.moving import Moving, at_step, check_moving, moves
 from sb3_symphony.common.noise import DecayingNormalActionNoise
-from sb3_symphony.common.off_policy import FADING_BUFFERS, EnsembleOffPolicyAlgorithm, UpdateLogs, noise_std, update_logs
+from sb3_symphony.common.off_policy import EnsembleOffPolicyAlgorithm, UpdateLogs, noise_std, update_logs
 from sb3_symphony.symphony.policies import Actor, CnnPolicy, MlpPolicy, MultiInputPolicy, SymphonyPolicy
 
 SelfSymphony = TypeVar("SelfSymphony", bound="Symphony")
@@ -226,11 +226,12 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         logs = update_logs()
         if self._n_updates == 0:
             uniform, faded = self.initial_gradient_steps
-            fades = isinstance(self.replay_buffer, FADING_BUFFERS)
+            fades = isinstance(self.replay_buffer, FadedSampling)
             self._update(uniform, batch_size, logs, **({"uniform": True} if fades else {}))
             self._update(faded, batch_size, logs)
         self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
         self._new_episodes = 0
+        self.logger.record("train/batch_size", batch_size)
         self._log_update(logs, noise_std(self.action_noise))
 
     def _set_mixes(self) -> None:
@@ -275,6 +276,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
 
         value = q_values.detach().mean()
         logs["actor_loss"].append(actor_loss.detach())
+        logs["actor_value"].append(value)
         logs["advantage"].append(value - self.baseline)
         self.baseline.copy_(value)
 

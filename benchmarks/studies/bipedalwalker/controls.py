@@ -1,7 +1,7 @@
 """
-Fair controls: TD3 and SAC as Stable-Baselines3 computes them, with the update engine, layer normalisation, averaged actor and
-whatever else ours are given, see td3.yml and sac.yml. With 20 updates for each step, by Stable-Baselines3's own classes one
-run of SAC would take seven hours. Names for ``algo``: ``controls.py:TD3Control`` and ``controls.py:SACControl``.
+Fair controls: TD3 and SAC as Stable-Baselines3 computes them (tests compare), by the update engine and with the layer
+normalisation, averaged actor and whatever else ours are given, see td3.yml and sac.yml. Names for ``algo``:
+``controls.py:TD3Control`` and ``controls.py:SACControl``.
 """
 
 from typing import ClassVar
