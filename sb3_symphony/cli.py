@@ -20,6 +20,7 @@ from sb3_symphony.experiment.config import (
     parse_pairs,
     shipped_environments,
     validated,
+    whose,
 )
 from sb3_symphony.experiment.plot import PlotOptions
 from sb3_symphony.experiment.registry import ALGORITHMS
@@ -228,7 +229,7 @@ def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     if arguments.get("quiet"):
         arguments |= {"progress": False, "verbose": 0}
     arguments.setdefault("progress", sys.stdout.isatty())
-    options = validated(TrainOptions, arguments)
+    options = validated(TrainOptions, whose(arguments.get("conf_file")) | arguments)
     check_algorithm(options.algo)  # before the slow imports
 
     from sb3_symphony.experiment.output import json_report
@@ -530,7 +531,7 @@ def _tune(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     for name, flag in (("hyperparams", "-params"), ("env_kwargs", "--env-kwargs")):
         if name in arguments:
             arguments[name] = parse_pairs(arguments[name], flag)
-    options = validated(TuneOptions, arguments)
+    options = validated(TuneOptions, whose(arguments.get("conf_file")) | arguments)
     check_algorithm(options.algo)  # before the slow imports
 
     from sb3_symphony.experiment.tune import tune

@@ -98,6 +98,11 @@ def test_run_folder(folder, capsys):
     assert "Pendulum-v1.zip | 450 steps" in summary and f"{last:.1f}" in summary
     assert TD3.load(run / "Pendulum-v1.zip").num_timesteps == 450
     assert (folder / "tb" / "Pendulum-v1" / "TD3_1").is_dir()
+    # Its configuration, which holds neither algorithm nor environment, is still that of its own
+    assert main(["train", "-conf", str(details / "config.yml"), "--dry-run"]) == 0
+    assert capsys.readouterr().out.startswith("# td3 on Pendulum-v1, ")
+    assert main(["train", "-conf", str(details / "config.yml"), "--algo", "ddpg", "--dry-run"]) == 0
+    assert capsys.readouterr().out.startswith("# ddpg on Pendulum-v1, ")
 
 
 @pytest.mark.parametrize("algo", ["symphony", "redq", "droq"])

@@ -287,6 +287,21 @@ def test_mistakes(model, capsys, arguments, message):
     assert sorted(model.parent.rglob("*")) == before
 
 
+@pytest.mark.parametrize("found", ["/nowhere/ffmpeg", RuntimeError("No ffmpeg exe could be found.")], ids=str)
+def test_mp4_without_ffmpeg(model, capsys, monkeypatch, found):
+    def get_ffmpeg_exe():
+        if isinstance(found, str):
+            return found
+        raise found
+
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", get_ffmpeg_exe)
+    monkeypatch.setenv("PATH", "")
+    before = sorted(model.parent.rglob("*"))
+    assert main("video agent --algo td3 --env Counter-v0 -n 2 --no-progress -o a.mp4".split()) == 2
+    assert "a.mp4: MP4 needs ffmpeg, and there is no '" in capsys.readouterr().err
+    assert sorted(model.parent.rglob("*")) == before
+
+
 def test_mp4_without_its_library(model, capsys, monkeypatch):
     monkeypatch.setattr("sb3_symphony.experiment.video.find_spec", lambda name: None)
     argv = "video agent --algo td3 --env Counter-v0 -n 2 --no-progress -o".split()

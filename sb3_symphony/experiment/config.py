@@ -412,6 +412,18 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
     return f"-conf {path}", content
 
 
+def whose(conf_file: str | None) -> dict[str, str]:
+    """
+    :param conf_file: value of ``-conf``
+    :return: ``algo`` and ``env`` of the run whose ``config.yml`` that is, which does not hold them; of other files, nothing
+    """
+    path = Path(conf_file or "")
+    options = path.parent / "args.yml"
+    if path.name != "config.yml" or not options.is_file():
+        return {}
+    return {name: value for name, value in read_yaml(options).items() if name in ("algo", "env")}
+
+
 def _override(plain: dict[str, Any], key: str, value: Any) -> None:
     """``policy_kwargs.net_arch`` changes one item of a mapping, ``policy_kwargs`` replaces all of it."""
     *parents, last = key.split(".")

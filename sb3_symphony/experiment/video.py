@@ -3,6 +3,7 @@
 import errno
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -381,12 +382,25 @@ def video(options: VideoOptions) -> list[Path]:
             else:
                 output = _default_output(options, film)
                 check_folder(output.parent, "--output")
-            if output.suffix.lower() == ".mp4" and find_spec("imageio_ffmpeg") is None:
-                raise ConfigError(f'{output}: MP4 needs imageio-ffmpeg: pip install "sb3-symphony[video]" — or use .gif')
+            if output.suffix.lower() == ".mp4":
+                _check_ffmpeg(output)
             if output in outputs:
                 raise ConfigError(f"'{output}' would be the film of two agents — expected each agent once, or --grid")
             outputs.append(output)
         return [_film(film, options, output) for film, output in zip(films, outputs, strict=True)]
+
+
+def _check_ffmpeg(output: Path) -> None:
+    if find_spec("imageio_ffmpeg") is None:
+        raise ConfigError(f'{output}: MP4 needs imageio-ffmpeg: pip install "sb3-symphony[video]" — or use .gif')
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    try:
+        program = get_ffmpeg_exe()
+    except RuntimeError:  # its package for this machine is without one, and none is installed
+        program = "ffmpeg"
+    if shutil.which(program) is None:
+        raise ConfigError(f"{output}: MP4 needs ffmpeg, and there is no '{program}' — install it, or use .gif")
 
 
 def _film(agents: Sequence[Shown], options: VideoOptions, output: Path) -> Path:
