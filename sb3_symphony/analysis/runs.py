@@ -274,7 +274,8 @@ def open_run(folder: Path) -> Run:
     monitors, details = _monitor_files(folder), next((path.parent for path in sorted(folder.glob("*/config.yml"))), None)
     if not monitors and details is None:
         what = "no run folder and no TensorBoard log" if folder.is_dir() else "no such folder"
-        raise ValueError(f"{folder}: {what} — expected one such as logs/symphony/BipedalWalker-v3_1")
+        many = " (a folder of such ones: -f)" if folder.is_dir() else ""
+        raise ValueError(f"{folder}: {what} — expected one such as logs/symphony/BipedalWalker-v3_1{many}")
     if details is None and not (name and number.isdecimal()):  # Monitor(env, folder): only the file names the environment
         with _monitor_file(monitors[0]) as (header, _):
             own = folder.absolute().name

@@ -22,18 +22,14 @@ class AveragedActor(BasePolicy):
     """
 
     actor: Any
+    actor_averaging: float  # part of all updates so far that the average reaches back; 0: no average
     averaged_actor: Any  # of the actor's class, None without
     n_averaged: th.Tensor  # (), updates so far
 
-    def start_average(self, actor_averaging: float) -> None:
-        """
-        To be called when the networks are built.
-
-        :param actor_averaging: part of all updates so far that the average reaches back; 0: no average
-        """
-        self.actor_averaging = actor_averaging
+    def start_average(self) -> None:
+        """To be called when the networks are built."""
         self.averaged_actor = None
-        if actor_averaging > 0:
+        if self.actor_averaging > 0:
             distribution = getattr(self.actor, "action_dist", None)
             # gSDE's holds noise matrices with a graph, which cannot be copied; the average needs none
             self.averaged_actor = copy.deepcopy(self.actor, {id(distribution): copy.copy(distribution)}).requires_grad_(False)

@@ -92,8 +92,8 @@ class TrainResult:
             return f"{self.run.path} is finished: {self.steps} steps{reached} — nothing changed{onward}"
         evaluated = "not evaluated"
         if self.evaluation:
-            mean, spread = np.mean(self.evaluation), np.std(self.evaluation)
-            evaluated = f"last evaluation {mean:.1f} ± {spread:.1f} ({len(self.evaluation)} episodes)"
+            mean, spread, n = np.mean(self.evaluation), np.std(self.evaluation), len(self.evaluation)
+            evaluated = f"last evaluation {mean:.1f} ± {spread:.1f} ({n} episode{'s' * (n > 1)})"
         minutes, seconds = divmod(round(self.seconds), 60)
         hours, minutes = divmod(minutes, 60)
         state = "interrupted, saved" if self.interrupted else "saved"

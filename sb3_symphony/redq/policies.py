@@ -1,17 +1,14 @@
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
-from sb3_symphony.common.averaging import AveragedActor
-from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import EnsembleCritic, check_net_arch, with_adam_defaults
-from sb3_symphony.common.regression import ENGINES
+from sb3_symphony.common.policies import EnsemblePolicy, LayerNorms
 
 
 def xavier_(module: nn.Module) -> None:
@@ -21,7 +18,7 @@ def xavier_(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
-class REDQPolicy(AveragedActor, SACPolicy):
+class REDQPolicy(EnsemblePolicy, SACPolicy):
     """
     Policy class (with both actor and critics) for REDQ and DroQ: SB3's SAC actor and an ensemble of critics.
 
@@ -56,7 +53,6 @@ class REDQPolicy(AveragedActor, SACPolicy):
     # Another class of critics than SB3's annotation
     critic: EnsembleCritic  # type: ignore[assignment]
     critic_target: EnsembleCritic  # type: ignore[assignment]
-    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
     def __init__(
         self,
@@ -76,20 +72,15 @@ class REDQPolicy(AveragedActor, SACPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         n_critics: int = 10,
         share_features_extractor: bool = False,
-        layer_norm: bool | Sequence[bool] = False,
+        layer_norm: LayerNorms = False,
         dropout_rate: float = 0.0,
         value_range: tuple[float, float] | None = None,
         n_bins: int = 51,
         critic_engine: str = "auto",
         actor_averaging: float = 0.0,
     ) -> None:
-        check_choice("critic_engine", critic_engine, ENGINES)
-        check_number("actor_averaging", actor_averaging, 0, 1)
         check_net_arch(net_arch)  # before the parent, which builds the actor
-        self.critic_engine = critic_engine
-        # Before the parent, which builds the networks
-        self.layer_norm, self.dropout_rate = layer_norm, dropout_rate
-        self.value_range, self.n_bins = value_range, n_bins
+        self.keep_options(layer_norm, dropout_rate, value_range, n_bins, critic_engine, actor_averaging)
         super().__init__(
             observation_space,
             action_space,
@@ -108,7 +99,7 @@ class REDQPolicy(AveragedActor, SACPolicy):
             n_critics,
             share_features_extractor,
         )
-        self.start_average(actor_averaging)
+        self.start_average()
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
@@ -123,16 +114,8 @@ class REDQPolicy(AveragedActor, SACPolicy):
         critic_kwargs.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, init="xavier")
         return EnsembleCritic(**critic_kwargs, value_range=self.value_range, n_bins=self.n_bins).to(self.device)
 
-    def set_training_mode(self, mode: bool) -> None:
-        super().set_training_mode(mode)
-        # SB3 keeps targets in evaluation mode; DroQ's dropout is active in them too
-        self.critic_target.q_networks.train(mode and self.dropout_rate > 0)
-
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate)
-        data.update(value_range=self.value_range, n_bins=self.n_bins)
-        data.update(critic_engine=self.critic_engine, actor_averaging=self.actor_averaging)
         data.update(share_features_extractor=self.share_features_extractor)  # which SACPolicy leaves out
         return data
 

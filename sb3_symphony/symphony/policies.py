@@ -1,23 +1,20 @@
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, FlattenExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor as TD3Actor
 from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-from sb3_symphony.common.averaging import AveragedActor
-from sb3_symphony.common.checks import check_choice, check_number
 from sb3_symphony.common.ensembles import EnsembleCritic, hidden_layers, mlp, with_adam_defaults
 from sb3_symphony.common.layers import LeakySine
-from sb3_symphony.common.regression import ENGINES
+from sb3_symphony.common.policies import EnsemblePolicy, LayerNorms
 
 Activations = type[nn.Module] | Sequence[type[nn.Module]]
-LayerNorms = bool | Sequence[bool]
 
 
 class Actor(TD3Actor):
@@ -73,7 +70,7 @@ class Actor(TD3Actor):
         return data
 
 
-class SymphonyPolicy(AveragedActor, TD3Policy):
+class SymphonyPolicy(EnsemblePolicy, TD3Policy):
     """
     Policy class (with both actor and critics) for Symphony.
 
@@ -110,7 +107,6 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
     actor: Actor
     critic: EnsembleCritic  # type: ignore[assignment]
     critic_target: EnsembleCritic  # type: ignore[assignment]
-    default_features_extractor: ClassVar[type[BaseFeaturesExtractor]] = FlattenExtractor
 
     def __init__(
         self,
@@ -134,12 +130,8 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
         critic_engine: str = "auto",
         actor_averaging: float = 0.0,
     ) -> None:
-        check_choice("critic_engine", critic_engine, ENGINES)
-        check_number("actor_averaging", actor_averaging, 0, 1)
-        self.critic_engine = critic_engine
-        # Before the parent, which builds the networks
-        self.layer_norm, self.dropout_rate, self.leaky_slope = layer_norm, dropout_rate, leaky_slope
-        self.value_range, self.n_bins = value_range, n_bins
+        self.keep_options(layer_norm, dropout_rate, value_range, n_bins, critic_engine, actor_averaging)
+        self.leaky_slope = leaky_slope
         super().__init__(
             observation_space,
             action_space,
@@ -154,7 +146,7 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
             n_critics,
             share_features_extractor,
         )
-        self.start_average(actor_averaging)
+        self.start_average()
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor = self.make_actor()
@@ -191,17 +183,8 @@ class SymphonyPolicy(AveragedActor, TD3Policy):
         kwargs = {**critic_kwargs, **self._network_kwargs("qf"), "dropout_rate": self.dropout_rate}
         return EnsembleCritic(**kwargs, value_range=self.value_range, n_bins=self.n_bins).to(self.device)
 
-    def set_training_mode(self, mode: bool) -> None:
-        super().set_training_mode(mode)
-        # SB3 keeps targets in evaluation mode; dropout is active in them too, as in DroQ
-        self.critic_target.q_networks.train(mode and self.dropout_rate > 0)
-
     def _get_constructor_parameters(self) -> dict[str, Any]:
-        data = super()._get_constructor_parameters()
-        data.update(layer_norm=self.layer_norm, dropout_rate=self.dropout_rate, leaky_slope=self.leaky_slope)
-        data.update(value_range=self.value_range, n_bins=self.n_bins)
-        data.update(critic_engine=self.critic_engine, actor_averaging=self.actor_averaging)
-        return data
+        return {**super()._get_constructor_parameters(), "leaky_slope": self.leaky_slope}
 
 
 MlpPolicy = SymphonyPolicy
