@@ -79,7 +79,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
     """
     Base class of Symphony and REDQ. Its arguments are those of SB3's ``OffPolicyAlgorithm``.
 
-    :param n_critics: Number of critics; may be given in ``policy_kwargs`` instead
+    :param n_critics: Number of critics; may be given in ``policy_kwargs`` instead (the default here counts as not given)
     :param policy_delay: Critic updates per actor update
     :param target_mode: How the target combines the critics: ``"min"``, ``"mean"`` or ``"rem"``
     :param critic_loss: Error function, see :data:`sb3_symphony.common.losses.CRITIC_LOSSES`; ``"hl_gauss"`` for critics that
