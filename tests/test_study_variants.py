@@ -236,7 +236,11 @@ CONTROLS = STUDIES / "bipedalwalker" / "controls.py"
 @pytest.mark.parametrize(
     ("control", "ours", "own"),
     [
-        ("td3", "symphony", ["learning_rate", "critic_learning_rate", "tau", "target_policy_noise", "saturation_penalty"]),
+        (
+            "td3",
+            "symphony",
+            ["learning_rate", "critic_learning_rate", "policy_delay", "target_policy_noise", "saturation_penalty"],
+        ),
         ("sac", "droq", ["learning_rate", "policy_delay", "ent_coef", "target_entropy", "replay_buffer_kwargs", "layer_norm"]),
     ],
 )
