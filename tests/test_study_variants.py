@@ -250,7 +250,7 @@ def test_controls_are_given_what_ours_are_given(control, ours, own):
     theirs.update(theirs["policy_kwargs"])
     ours.update(ours["policy_kwargs"])
     common = ["env_wrapper", "learning_starts", "batch_size", "n_steps", "gradient_steps", "net_arch", "actor_averaging"]
-    common += ["action_noise", "callback", "n_timesteps"]
+    common += ["action_noise", "callback", "n_timesteps", "learning_rate", "policy_delay"]
     for key in [*common, *own]:
         assert theirs.get(key) == ours.get(key), key
     assert theirs["replay_buffer_kwargs"]["mirror"] == ours["replay_buffer_kwargs"]["mirror"]
