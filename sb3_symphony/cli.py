@@ -640,7 +640,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed by the one who started it
-            setattr(sys, name, open(os.devnull, "w"))
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # results are not lost for a character that a terminal does not have
     if "" not in sys.path:
@@ -655,7 +655,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments["progress"] = False
     quiet = silent and arguments.get("json_file") != "-"
     try:
-        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere) if quiet else nullcontext():
+        with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere) if quiet else nullcontext():
             code = run(arguments, argv)
         sys.stdout.flush()
         return code

@@ -10,6 +10,7 @@ from stable_baselines3.common.monitor import Monitor
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis.runs import (
+    Damaged,
     Scalar,
     find_runs,
     group_runs,
@@ -97,6 +98,14 @@ def test_no_episode_yet(tmp_path):
     assert read_episodes(tmp_path) is None and read_evaluations(tmp_path) is None
     write_monitor(tmp_path / "0.monitor.csv", 0.0, [])
     assert read_episodes(tmp_path).steps.shape == (0,)
+
+
+def test_nulls_of_a_power_cut(tmp_path):
+    write_monitor(tmp_path / "0.monitor.csv", 0.0, [(1.0, 10, 1.0)])
+    with (tmp_path / "0.monitor.csv").open("a") as file:
+        file.write("\0" * 200_000)
+    with pytest.raises(Damaged, match="or damaged"):
+        read_episodes(tmp_path)
 
 
 def test_damaged_files(tmp_path):

@@ -45,6 +45,13 @@ def fails(capsys, *argv: str) -> str:
 COMMANDS = ["train", "enjoy", "evaluate", "export", "tune", "plot", "video", "gait", "bench", "list"]
 
 
+def test_quiet_in_any_locale():
+    """What nobody sees is no reason to fail: some locales have no ±."""
+    code = "from sb3_symphony import cli; cli._evaluate = lambda *args: print(chr(177)); cli.main(['evaluate', '--quiet'])"
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+
 @pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_help_fits_one_screen(capsys, command):
     with pytest.raises(SystemExit) as error:

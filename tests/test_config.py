@@ -32,6 +32,8 @@ from sb3_symphony.experiment.config import (
 from sb3_symphony.experiment.decode import algorithm_arguments, argument_types, class_by_name, typed_arguments
 from sb3_symphony.experiment.environment import find_wrapper, for_training_only, split_wrappers
 from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
+from sb3_symphony.experiment.signals import ended_by
+from sb3_symphony.experiment.space import TuneOptions
 
 ACTIONS = spaces.Box(-1.0, 1.0, (4,))
 
@@ -403,3 +405,13 @@ def test_presets_are_found_by_name():
         arguments = algorithm_arguments("symphony", load_algorithm("symphony"), load_config(options), ACTIONS)
         assert arguments.get("n_critics", 2) == (1 if name == "symphony-original" else 2)
         assert "env_wrapper" not in load_config(options).plain
+
+
+def test_bounds_are_told_in_signs():
+    with pytest.raises(ConfigError, match="timeout: 0 — expected a number > 0"):
+        validated(TuneOptions, {"timeout": 0})
+
+
+def test_signals_without_a_name():
+    assert ended_by(-9) == "its process was ended by SIGKILL (out of memory?)"
+    assert ended_by(-50) == "its process was ended by signal 50"  # a real-time one

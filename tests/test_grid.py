@@ -470,9 +470,9 @@ def die_once():
 
 
 def test_a_worker_of_ray_that_dies_is_replaced(cluster, folder, die_once):
-    from sb3_symphony.experiment.backends import open_backend
+    from sb3_symphony.experiment.backends import Ray
 
-    backend = open_backend("ray", address=cluster.address)
+    backend = Ray(None, cluster.address, gpus=False)
     try:
         results = dict(backend.map(die_once, [str(folder / "a"), str(folder / "b")]))
     finally:
@@ -481,9 +481,9 @@ def test_a_worker_of_ray_that_dies_is_replaced(cluster, folder, die_once):
 
 
 def test_a_worker_of_loky_that_dies_is_replaced(folder, die_once):
-    from sb3_symphony.experiment.backends import open_backend
+    from sb3_symphony.experiment.backends import Loky
 
-    backend = open_backend("loky", n_jobs=2)
+    backend = Loky(2)
     try:
         results = dict(backend.map(die_once, [str(folder / name) for name in "abc"]))
         assert results == {str(folder / name): "second time" for name in "abc"}

@@ -219,6 +219,18 @@ def test_other_agent_to_start_from(study, tmp_path, fails, change, message):
     fails(["bench", str(tmp_path / "study.yml"), "--report", "-f", str(study / "results")], message)
 
 
+def test_another_version_of_an_own_algorithm(study, tmp_path, fails):
+    """Its name tells nothing: cells that are done would stand beside others of the new version."""
+    (tmp_path / "own_td3.py").write_text(OWN + "# changed\n")
+    (tmp_path / "space.yml").write_text((study / "space.yml").read_text())
+    (tmp_path / "study.yml").write_text(yaml.safe_dump(STUDY))
+    command = ["bench", str(tmp_path / "study.yml"), "-f", str(study / "results")]
+    for flags in ([], ["--report"]):
+        fails([*command, *flags], "own/Pendulum-v1_3: was trained with '", "own_td3.py' differs — expected the same")
+    assert (study / "results" / "settings" / "own_td3.py").read_text() == OWN
+    assert main([*command, "--dry-run", "-a", "base"]) == 0
+
+
 def test_a_search_of_another_space(study, tmp_path, fails):
     (tmp_path / "own_td3.py").write_text(OWN)
     (tmp_path / "space.yml").write_text("learning_rate: [1e-3, 1e-5]\n")

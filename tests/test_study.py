@@ -184,6 +184,13 @@ def test_start_from_another_cell(write, tmp_path):
     assert [each.name for each in read_study(path, only=["base"]).algorithms] == ["base"]
 
 
+def test_quick_version_without_a_cell(write):
+    algorithms = [{"name": "sac", "environments": ["Pendulum-v1"]}]
+    path = write(algorithms=algorithms, quick={"environments": ["BipedalWalker-v3"]})
+    with pytest.raises(ConfigError, match="quick: environments: BipedalWalker-v3 — no algorithm of the quick version runs"):
+        read_study(path)
+
+
 def test_sweeps_conditions_and_figures(write, tmp_path):
     (tmp_path / "fixed.yml").write_text("n_timesteps: 99\ngamma: 0.3\n")
     wrapper = "gymnasium.wrappers.TimeLimit"
@@ -209,6 +216,19 @@ def test_sweeps_conditions_and_figures(write, tmp_path):
     found = cells_of(study, tmp_path, tmp_path / "results")[0]
     assert not found.waits and configuration(found).arguments == {"gamma": 0.7}
     assert read_study(write(sweeps={})).sweeps == {}
+
+
+def test_sweep_of_an_own_algorithm(write, tmp_path, monkeypatch):
+    """In a file beside the study, wherever the command is typed."""
+    (tmp_path / "own.py").write_text("from stable_baselines3 import TD3\n\n\nclass Own(TD3):\n    pass\n")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "space.yml").write_text("gamma: [0.9, 0.99]\n")
+    sweep = {"algo": "own.py:Own", "conf_file": "td3", "space": "space.yml", "env": "Pendulum-v1"}
+    path = write(sweeps={"s": sweep})
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    options = sweep_options(read_study(path), "s", tmp_path, tmp_path / "results")
+    assert options.algo == f"{tmp_path}/own.py:Own"
+    assert options.folder == tmp_path / "results" / "sweeps" / "own.py:Own" / "tune" / "s"
 
 
 def test_algorithms_of_a_file(write, tmp_path):

@@ -120,7 +120,7 @@ def _monitor_file(path: Path) -> Iterator[tuple[dict[str, Any], Iterator[str]]]:
     try:
         with path.open(encoding="utf-8", newline="") as lines:
             yield json.loads(lines.readline().removeprefix("#")), lines
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, OSError, csv.Error) as error:
         raise Damaged(f"{path}: not a monitor file of Stable-Baselines3, or damaged — {error}") from None
 
 
@@ -196,7 +196,7 @@ def read_scalar_table(path: Path) -> dict[str, Scalar]:
             steps, seconds, values = points.reshape(-1, 3).T
             scalars[tag] = Scalar(steps.astype(np.int64), seconds, values)
         return scalars
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, OSError, csv.Error) as error:
         raise Damaged(f"{path}: no table of scalars, or damaged — {error}") from None
 
 

@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 
 from sb3_symphony.analysis.runs import Run
 
+#: environment seed of the first evaluation episode in the course of a training
+EVALUATION_SEED = 10_000
 #: numbers drawn at once, 32 MB
 _CHUNK = 4_000_000
 
@@ -127,23 +129,22 @@ class Event:
         return f"{'' if self.reached else '> '}{self.step}"
 
 
-def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold: float = 300.0, consecutive: int = 2) -> Event:
+def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold: float = 300.0) -> Event:
     """
-    The first of some consecutive evaluations whose mean return is at least the threshold ("S300").
+    The first of two consecutive evaluations whose mean return is at least the threshold ("S300").
 
     :param timesteps: environment steps of the evaluations, shape ``(n,)``
     :param results: their returns, shape ``(n, episodes)``
     :param threshold: mean return to reach
-    :param consecutive: number of evaluations that must reach it
     :return: the event; censored at the last evaluation that cannot be the first of them
     """
     steps = np.asarray(timesteps, dtype=np.int64)
     if len(steps) == 0:
         return Event(False, 0)
     good = np.asarray(results, dtype=np.float64).mean(axis=1) >= threshold
-    for first in range(len(steps) - consecutive + 1):
-        if good[first : first + consecutive].all():
-            return Event(True, int(steps[first]))
+    both = np.flatnonzero(good[:-1] & good[1:])
+    if len(both):
+        return Event(True, int(steps[both[0]]))
     bad = np.flatnonzero(~good)  # after the last of them, more good ones might have followed
     return Event(False, int(steps[bad[-1]]) if len(bad) else 0)
 

@@ -13,6 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from sb3_symphony.common.files import completed
+
 #: Okabe and Ito's colours, the light ones darkened so that text in them is readable on white
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#A8467F", "#000000", "#B27500", "#2E8BBF")
 #: told apart in greyscale too
@@ -63,29 +65,19 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def check_suffix(output: Path) -> None:
-    """
-    :param output: image file
-    :raises ValueError: if its name does not end in one of :data:`SUFFIXES`
-    """
-    if output.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{output}: expected a name that ends in {', '.join(SUFFIXES)}")
-
-
 def save(figure: Figure, output: Path) -> Path:
     """
     :param figure: what to save
     :param output: image file, its kind told by its suffix; a file of that name is replaced once the new one is complete
     :return: the file
+    :raises ValueError: if its name does not end in one of :data:`SUFFIXES`
     """
-    check_suffix(output)
-    unfinished = output.with_name(f".{output.stem}.tmp{output.suffix}")
+    if output.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{output}: expected a name that ends in {', '.join(SUFFIXES)}")
     undated = {".png": {}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}[output.suffix.lower()]
-    try:
+    with completed(output) as unfinished:
         figure.savefig(unfinished, dpi=200, metadata=undated)
-        return unfinished.replace(output)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    return output
 
 
 def line_style(index: int) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from sb3_symphony.analysis.runs import Run, Scalar, told_apart
 from sb3_symphony.analysis.statistics import (
+    EVALUATION_SEED,
     Event,
     RunEvents,
     bootstrap_interval,
@@ -28,9 +29,6 @@ from sb3_symphony.analysis.statistics import (
     run_events,
     summarise,
 )
-
-#: environment seed of the first evaluation episode
-_EVALUATION_SEED = 10_000
 
 
 @dataclass(frozen=True)
@@ -170,20 +168,17 @@ def episode_rows(results: Iterable[Result]) -> Iterator[Row]:
         if evaluations is not None:
             for i, step in enumerate(evaluations.steps):
                 returns, lengths = evaluations.returns[i], evaluations.lengths[i]
-                seeds = range(_EVALUATION_SEED, _EVALUATION_SEED + len(returns))
+                seeds = range(EVALUATION_SEED, EVALUATION_SEED + len(returns))
                 successes = None if evaluations.successes is None else evaluations.successes[i]
                 yield from rows(result, "evaluation", [step] * len(returns), seeds, returns, lengths, successes)
-        final = (result.summary or {}).get("final")
-        if final:
-            n = len(final["returns"])
-            assert result.summary is not None
-            seeds, steps = range(final["seed"], final["seed"] + n), [result.summary["steps"]] * n
-            yield from rows(result, "final", steps, seeds, final["returns"], final["lengths"], final["successes"])
         summary = result.summary or {}
-        for name, each in summary.get("conditions", {}).items():
-            n = len(each["returns"])
-            seeds, steps = range(each["seed"], each["seed"] + n), [summary["steps"]] * n
-            yield from rows(result, f"condition {name}", steps, seeds, each["returns"], each["lengths"], each["successes"])
+        at_the_end = {"final": summary.get("final")}
+        at_the_end |= {f"condition {name}": each for name, each in summary.get("conditions", {}).items()}
+        for kind, each in at_the_end.items():
+            if each:
+                n = len(each["returns"])
+                seeds, steps = range(each["seed"], each["seed"] + n), [summary["steps"]] * n
+                yield from rows(result, kind, steps, seeds, each["returns"], each["lengths"], each["successes"])
 
 
 def _event(name: str, event: Event | None) -> Row:

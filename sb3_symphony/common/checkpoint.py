@@ -13,7 +13,6 @@ A checkpoint holds pickled objects: resume only runs of people you trust.
 
 import inspect
 import os
-import platform
 import random
 import re
 import time
@@ -21,7 +20,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +31,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.save_util import recursive_getattr
 
-from sb3_symphony import __version__
 from sb3_symphony.common.buffers import end_trajectory
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.files import DamagedFile, checked_content, seal, unseal
 from sb3_symphony.common.recording import each_copy, is_recorded, restore_vec_env, vec_env_state
 from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, restore_buffer
+from sb3_symphony.common.versions import package_versions, processor
 
 # ----------------------------------------------------------------------------------------------------------------------
 # State
@@ -87,7 +85,7 @@ def _restore_generators(model: BaseAlgorithm, states: dict[str, Any]) -> None:
     np.random.set_state(states["numpy"])
     th.set_rng_state(states["torch"])
     if states["cuda"] and th.cuda.is_available():
-        th.cuda.set_rng_state_all(states["cuda"])
+        th.cuda.set_rng_state_all(states["cuda"][: th.cuda.device_count()])  # there may have been more
     model.action_space.np_random.bit_generator.state = states["action space"]
 
 
@@ -96,12 +94,9 @@ def platform_of(model: BaseAlgorithm) -> dict[str, str]:
     :param model: an algorithm
     :return: what has to be the same for results to be equal bit for bit
     """
-    packages = ("torch", "numpy", "numba", "stable_baselines3", "sb3_contrib", "gymnasium")
     return {
-        "sb3_symphony": __version__,
-        **{package: version(package) for package in packages},
-        "Python": platform.python_version(),
-        "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
+        **package_versions(),
+        "processor": processor(),
         "threads": str(th.get_num_threads()),
         "device": model.device.type,
     }

@@ -8,6 +8,8 @@ import hashlib
 import io
 import os
 import pickle
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,22 @@ def write_atomically(path: Path, content: bytes) -> None:
         temporary.unlink(missing_ok=True)
         raise
     _synchronise_folder(path.parent)
+
+
+@contextmanager
+def completed(path: Path) -> Iterator[Path]:
+    """
+    For what writes a file itself: it is replaced once all is written, and left as it was if something goes wrong.
+
+    :param path: the file
+    :return: where to write meanwhile, a name with the same suffix beside it
+    """
+    unfinished = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield unfinished
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def seal(path: Path, content: Any) -> str:

@@ -9,14 +9,13 @@ cell then goes on from its checkpoint.
 """
 
 import os
-import platform
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from sb3_symphony.common.versions import package_versions
 from sb3_symphony.experiment.config import ConfigError
 
 Item = TypeVar("Item")
@@ -46,18 +45,6 @@ class Backend(Protocol):
 
     def close(self) -> None:
         """Leave no worker behind."""
-
-
-def open_backend(name: str, n_jobs: int | None = None, address: str | None = None, gpus: bool = False) -> Backend:
-    """
-    :param name: ``loky`` or ``ray``
-    :param n_jobs: cells at a time, by default as many as there are cores
-    :param address: Ray cluster to use; by default one is started here, and ended again
-    :param gpus: whether a cell needs a GPU of its own (Ray shows none to others)
-    :return: the backend, connected
-    :raises ConfigError: if Ray is not installed or the cluster cannot be reached
-    """
-    return Ray(n_jobs, address, gpus) if name == "ray" else Loky(n_jobs)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -116,13 +103,6 @@ class Loky:
 # ----------------------------------------------------------------------------------------------------------------------
 # A cluster
 # ----------------------------------------------------------------------------------------------------------------------
-
-_VERSIONS = ("sb3-symphony", "torch", "numpy", "stable_baselines3", "gymnasium")
-
-
-def package_versions() -> dict[str, str]:
-    """:return: those of Python and the packages that results depend on"""
-    return {"Python": platform.python_version(), **{package: version(package) for package in _VERSIONS}}
 
 
 def _seen(token: str) -> tuple[str, str | None, dict[str, str]]:

@@ -280,6 +280,3 @@ class ReturnProgressBar(BaseCallback):
     def close(self) -> None:
         """Leave the terminal in order, also after an error."""
         self.progress.stop()
-
-    def _on_training_end(self) -> None:
-        self.close()

@@ -11,7 +11,6 @@ A worker imports this module; what is heavy is imported by the cell's own proces
 
 import json
 import os
-import platform
 import shlex
 import shutil
 import signal
@@ -29,6 +28,7 @@ from typing import Any, Literal
 from urllib.parse import quote
 
 from sb3_symphony.common.files import write_atomically
+from sb3_symphony.common.versions import package_versions, processor
 from sb3_symphony.experiment.config import ConfigError, TrainOptions
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.signals import ended_by
@@ -196,7 +196,7 @@ def _obey(control: Control) -> None:
             obeyed += 1
             if obeyed == 3:
                 os._exit(_STOPPED)
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)  # os.kill() would end the process on Windows
 
 
 def result_file(run: Path) -> Path:
@@ -313,11 +313,9 @@ def _machine(device: str) -> dict[str, Any]:
     import torch as th
     from stable_baselines3.common.utils import get_device
 
-    from sb3_symphony.experiment.backends import package_versions
-
     return {
         "host": socket.gethostname(),
-        "processor": f"{platform.machine()} {th.backends.cpu.get_cpu_capability()}",
+        "processor": processor(),
         "cores": os.cpu_count(),
         **({"gpu": th.cuda.get_device_name()} if get_device(device).type == "cuda" else {}),
         **package_versions(),

@@ -348,8 +348,9 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
             first["msg"].removeprefix("Value error, ").partition(", unable to")[0].replace("Input should be", "expected", 1)
         )
         message = message.replace("String should have", "expected")
-        for words, sign in (("greater than or equal to", ">="), ("less than or equal to", "<="), ("less than", "<")):
-            message = message.replace(words, f"a number {sign}")
+        signs = {"greater than or equal to": ">=", "greater than": ">", "less than or equal to": "<=", "less than": "<"}
+        for words, sign in signs.items():
+            message = message.replace(f"expected {words}", f"expected a number {sign}")
         message = message.replace("a valid integer", "a whole number").replace("a valid ", "a ")
         raise ConfigError(f"{key}: {values.get(key)!r} — {message}") from None
 

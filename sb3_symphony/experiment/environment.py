@@ -27,15 +27,13 @@ from stable_baselines3.common.vec_env import (
     unwrap_vec_normalize,
 )
 
+from sb3_symphony.analysis.statistics import EVALUATION_SEED
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.recording import RecordedEpisode
 from sb3_symphony.common.wrappers import EpisodeStepLimit, FreshBox2DWorld, LearningReward, needs_fresh_world
 from sb3_symphony.experiment.config import ConfigError, RunSettings, reason, told
 from sb3_symphony.experiment.decode import typed_arguments
 from sb3_symphony.experiment.registry import without_module
-
-#: evaluation episode i runs on environment seed 10 000 + i
-EVALUATION_SEED = 10_000
 
 _WRAPPER_PACKAGES = ("sb3_symphony.", "gymnasium.wrappers.", "stable_baselines3.", "sb3_contrib.")
 #: a configuration must not choose what is written where
@@ -57,15 +55,13 @@ Wrappers = list[Callable[[gym.Env], gym.Env]]
 
 class EpisodeSeeds(gym.Wrapper):
     """
-    Runs the i-th episode since :meth:`restart_seeds` on environment seed ``first + i``.
+    Runs the i-th episode since :meth:`restart_seeds` on environment seed 10 000 + i.
 
     :param env: environment
-    :param first: seed of the first episode
     """
 
-    def __init__(self, env: gym.Env, first: int = EVALUATION_SEED) -> None:
+    def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        self.first = first
         self.episode = 0
 
     def restart_seeds(self) -> None:
@@ -78,7 +74,7 @@ class EpisodeSeeds(gym.Wrapper):
         :param options: handed to the environment
         :return: first observation and info
         """
-        seed = self.first + self.episode
+        seed = EVALUATION_SEED + self.episode
         self.episode += 1
         return self.env.reset(seed=seed, options=options)
 

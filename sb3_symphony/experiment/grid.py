@@ -262,7 +262,7 @@ def _job(progress: Progress, folder: Path, session: Path, tensorboard: bool) -> 
 
 
 def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: Path, path: Path) -> BenchResult:
-    from sb3_symphony.experiment.backends import open_backend
+    from sb3_symphony.experiment.backends import Loky, Ray
     from sb3_symphony.experiment.output import alone, full_disk_told, output_folder
 
     left = [each for each in progress if not each.kept]
@@ -273,7 +273,8 @@ def _run(options: BenchOptions, study: Study, progress: list[Progress], folder: 
         _check_models(left)
         _check_searches(study, left, path, folder)
         gpus = any(each.cell.options.device.startswith("cuda") for each in left)
-        backend = open_backend(options.backend, options.n_jobs, options.address, gpus)
+        use_ray = options.backend == "ray"
+        backend: Backend = Ray(options.n_jobs, options.address, gpus) if use_ray else Loky(options.n_jobs)
         try:
             new = not folder.exists()
             with alone(output_folder(folder, "-f"), in_use), full_disk_told([folder], "the same command goes on"):
@@ -379,6 +380,7 @@ class _Session:
         self.jobs = [_job(each, folder, session, tensorboard) for each in ready]
         self.control = Control(session / "control.json")
         self.backend = backend
+        self.look_at: dict[str, float] = {}  # when to read next how far a cell is
         self.stop = 0  # how often that was asked for
         self.ended: SimpleQueue[tuple[Job, Outcome | Exception]] = SimpleQueue()
         self.error: Exception | None = None
@@ -423,8 +425,11 @@ class _Session:
             each = self.left[job.name]
             if each.state == "queued" and job.started.is_file():
                 each.state = "running"
-            if each.state == "running":
+            now = time.monotonic()
+            if each.state == "running" and now >= self.look_at.get(job.name, 0.0):
                 each.look()
+                # Long files take time, which is not taken from the trainings: at most a hundredth of it
+                self.look_at[job.name] = now + 100 * (time.monotonic() - now)
                 if each.since is None:
                     each.since = (time.monotonic(), each.steps)
         while not self.ended.empty():

@@ -119,6 +119,7 @@ def _standing(cell: Cell, folder: Path) -> Progress:
     if not begun(run):
         return progress
     _check_same(progress)
+    _check_file(cell, folder)
     progress.look()
     result = read_result(run.path)
     _check_conditions(progress, result or {})
@@ -171,6 +172,16 @@ def _check_same(progress: Progress) -> None:
             raise ConfigError(
                 f"{cell.name}: was trained with {name} {there!r}, the study has {wanted!r} — expected the same, or another -f"
             )
+
+
+def _check_file(cell: Cell, folder: Path) -> None:
+    """Refuse to go on with another version of the algorithm's own file."""
+    file, _, _ = cell.options.algo.rpartition(":")
+    kept = folder / "settings" / Path(file).name
+    if file and kept.is_file() and kept.read_bytes() != Path(file).read_bytes():
+        raise ConfigError(
+            f"{cell.name}: was trained with '{kept}', from which '{file}' differs — expected the same, or another -f"
+        )
 
 
 def _check_beginning(progress: Progress, source: Progress) -> None:

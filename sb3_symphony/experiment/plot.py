@@ -65,9 +65,7 @@ def plot(options: PlotOptions, groups: "list[Group] | None" = None) -> Path:
     tell = json_report(options.json_file)
     try:
         groups = _groups(options) if groups is None else groups
-        output = Path(options.output or _default_output(options, groups))
-        style.check_suffix(output)
-        output_file(options.output or output, "--output")
+        output = output_file(options.output or _default_output(options, groups), "--output", style.SUFFIXES)
         panels = _scalar_panels(options, groups) if options.kind == "scalars" else _curve_panels(options, groups)
     except ConfigError:
         raise

@@ -51,7 +51,7 @@ def ended_by(code: int) -> str:
     :param code: exit code of a process that a signal has ended
     :return: what it ended by, in words
     """
-    name = signal.Signals(-code).name
+    name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"  # real-time ones have no name
     return f"its process was ended by {name}" + " (out of memory?)" * (name == "SIGKILL")
 
 

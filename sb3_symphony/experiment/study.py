@@ -465,9 +465,12 @@ def _check(study: Study, folder: Path) -> None:
 
 
 def _algo(algorithm: Algorithm, folder: Path) -> str:
+    return _whole(algorithm.algo or algorithm.name, folder)
+
+
+def _whole(algo: str, folder: Path) -> str:
     """The algorithm, where it is one of a file beside the study with the whole path."""
-    name = algorithm.algo or algorithm.name
-    return str(folder / name) if is_file(name) else name
+    return str(folder / algo) if is_file(algo) else algo
 
 
 def _environments(study: Study, algorithm: Algorithm) -> dict[str, Environment]:
@@ -516,6 +519,8 @@ def _quick(study: Study) -> Study:
         if (value := getattr(quick, name)) is not None
     }
     kept = [each for each in algorithms if each.environments is None or there.intersection(each.environments)]
+    if not kept:
+        raise ConfigError(f"quick: environments: {', '.join(sorted(there))} — no algorithm of the quick version runs there")
     return study.model_copy(
         update={
             **changes,
@@ -602,7 +607,8 @@ def sweep_options(study: Study, name: str, folder: Path, results: Path) -> TuneO
     settled = {"log_folder": str(results / "sweeps"), "study_name": name, "device": study.device, "num_threads": 1}
     sweep = study.sweeps[name]
     space = None if sweep.space is None else str(folder / sweep.space)
-    return sweep.model_copy(update={**settled, "conf_file": _conf(sweep.conf_file, folder), "space": space})
+    own = {"algo": _whole(sweep.algo, folder), "conf_file": _conf(sweep.conf_file, folder), "space": space}
+    return sweep.model_copy(update={**settled, **own})
 
 
 def _conf(name: str | None, folder: Path) -> str | None:

@@ -223,7 +223,7 @@ def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
         counted = _counted(states)
         hours = sum(float(row["seconds"] or 0) for row in rows) / 3600
         completed = [(-float(row["value"]), int(row["number"]), row) for row in rows if row["state"] == "complete"]
-    except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
+    except (OSError, csv.Error, KeyError, ValueError) as error:
         raise ConfigError(f"'{path}': no table of trials — {told(error)}") from None
     ended = sum(state in ("complete", "pruned", "fail") for state in states)
     summary = f"{ended} of {n_trials} trials ({counted}), {hours:.1f} hours one after the other."

@@ -244,16 +244,19 @@ class JournalSweep:
             return False
         try:
             with FileLock(sign, timeout=0):
-                sign.unlink(missing_ok=True)
-            return False
+                pass
         except Timeout:
             return True
+        with suppress(OSError):
+            sign.unlink(missing_ok=True)  # not before: Windows keeps what is open
+        return False
 
     def close(self) -> None:
         """Take away the sign of life."""
         if self._alive is not None:
-            self._sign(self.worker).unlink(missing_ok=True)
             self._alive.release()
+            with suppress(OSError):
+                self._sign(self.worker).unlink(missing_ok=True)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -189,20 +189,6 @@ def _callbacks(
     return stop, evaluation, counting
 
 
-def _checkpoints(
-    options: TrainOptions, run: RunFolder, callbacks: list[BaseCallback], checkpoint: Checkpoint | None, stop: StopOnSignal
-) -> ExactCheckpoints:
-    return ExactCheckpoints(
-        run.checkpoints,
-        options.save_freq,
-        options.keep,
-        callbacks=tuple(callbacks),
-        files=run.growing_files,
-        checkpoint=checkpoint,
-        wanted=stop.here,
-    )
-
-
 def build_callbacks(options: TrainOptions, config: RunConfig, model: BaseAlgorithm, cleanup: ExitStack) -> list[BaseCallback]:
     """
     :param options: options of the command line
@@ -408,7 +394,15 @@ def _train(
     callbacks += own_callbacks
     checkpoints = None
     if options.save_freq > 0:
-        checkpoints = _checkpoints(options, run, callbacks, checkpoint, stop)
+        checkpoints = ExactCheckpoints(
+            run.checkpoints,
+            options.save_freq,
+            options.keep,
+            callbacks=tuple(callbacks),
+            files=run.growing_files,
+            checkpoint=checkpoint,
+            wanted=stop.here,
+        )
         callbacks.append(checkpoints)
     callbacks += [stop, NoteLogFolder(run.log_folder)]  # the checkpoint is made before
     if options.progress:

@@ -31,6 +31,7 @@ from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.callbacks import StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, check_algorithm, load_config, merge
 from sb3_symphony.experiment.output import check_folder, output_folder
+from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.space import SearchSpace, TuneOptions, read_space
 from sb3_symphony.experiment.sweep_report import ENDED, PLAN, REASON, RETURNS, SweepReport, best_of, parameters_of, replaced
 from sb3_symphony.experiment.sweep_storage import WORKER, StorageAway, SweepStorage, open_storage
@@ -135,7 +136,10 @@ class Plan:
         :param where: where it comes from, for messages
         :raises ConfigError: if this is another one
         """
-        for key, value in self.plain().items():
+        plan = self.plain()
+        if without_folder(str(found.get("algo"))) == without_folder(plan["algo"]):  # the file may have been moved
+            found = {**found, "algo": plan["algo"]}
+        for key, value in plan.items():
             if found.get(key) != value:
                 what, there, here = _difference(key, found.get(key), value)
                 if there is None:

@@ -25,6 +25,7 @@ from stable_baselines3.common.atari_wrappers import MaxAndSkipEnv
 from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_symphony.analysis.runs import named_apart
+from sb3_symphony.common.files import completed
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError, told
 from sb3_symphony.experiment.output import check_folder, output_file, progress_bar
@@ -295,13 +296,8 @@ def write_film(pictures: Iterable[np.ndarray], fps: float, output: Path) -> int:
     :param output: file whose name ends in .mp4 (H.264) or .gif
     :return: number of pictures
     """
-    unfinished = output.with_name(f".{output.stem}.tmp{output.suffix}")
-    try:
-        n_pictures = (_write_gif if output.suffix.lower() == ".gif" else _write_mp4)(pictures, fps, unfinished)
-        unfinished.replace(output)
-        return n_pictures
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with completed(output) as unfinished:
+        return (_write_gif if output.suffix.lower() == ".gif" else _write_mp4)(pictures, fps, unfinished)
 
 
 def _write_mp4(pictures: Iterable[np.ndarray], fps: float, output: Path) -> int:
