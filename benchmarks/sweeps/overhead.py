@@ -96,7 +96,7 @@ def work(where: str, n_trials: int, begin: float) -> dict[str, Any]:
     study = tune._open_study(plan, storage)
     sweep = tune.Sweep(plan, storage, study, StopOnSignal())
     sweep._wait = lambda: None if sweep._running else time.sleep(0.05)  # type: ignore[method-assign]  # timed
-    for name in ("claim", "_follow", "_tell"):
+    for name in ("claim", "_tell"):
         setattr(sweep, name, timed(getattr(sweep, name), parts[name].append))
     for name in ("should_prune", "report"):
         setattr(optuna.Trial, name, timed(getattr(optuna.Trial, name), parts[name].append))

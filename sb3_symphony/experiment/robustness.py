@@ -12,7 +12,8 @@ from sb3_symphony.common.checks import check_number
 
 class ObservationNoise(gym.Wrapper):
     """
-    Adds independent Gaussian noise to every number of every observation. A reset with a seed seeds the noise as well.
+    Adds independent Gaussian noise to every number of every observation. A reset with a seed seeds the noise as well, with the
+    stream of numbers that an environment of that seed draws from its own generator.
 
     :param env: environment with observations of real numbers
     :param std: standard deviation in the observation's units, >= 0

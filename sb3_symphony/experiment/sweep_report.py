@@ -122,7 +122,7 @@ class SweepReport:
 
     def write(self) -> None:
         """
-        Write ``plan.json``, ``trials.csv`` and, if a trial has completed, ``best.yml`` and figures.
+        Write ``plan.json``, ``trials.csv``, ``best.yml`` if a trial has completed, and figures if two have.
 
         :raises ConfigError: if they cannot be written
         """
