@@ -178,6 +178,7 @@ class SymphonyPolicy(EnsemblePolicy, TD3Policy):
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return Actor(**{**actor_kwargs, **self._network_kwargs("pi")}).to(self.device)
 
+    # SB3 annotates its own class of critics, which the ensemble stands in for
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         kwargs = {**critic_kwargs, **self._network_kwargs("qf"), "dropout_rate": self.dropout_rate}
