@@ -86,7 +86,7 @@ def work(where: str, n_trials: int, begin: float) -> dict[str, Any]:
     :param begin: moment at which all begin
     :return: seconds it worked and computed, and milliseconds of each part of each of its trials
     """
-    tune.TrialProcesses = NoTraining  # type: ignore[misc,assignment]  # in this process only
+    tune.TrialProcesses = NoTraining  # in this process only
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     parts: dict[str, list[float]] = defaultdict(list)
     numbers: list[int] = []
@@ -95,7 +95,7 @@ def work(where: str, n_trials: int, begin: float) -> dict[str, Any]:
     storage = open_storage(where, lambda: None, options.heartbeat)
     study = tune._open_study(plan, storage)
     sweep = tune.Sweep(plan, storage, study, StopOnSignal())
-    sweep._wait = lambda: None if sweep._running else time.sleep(0.05)  # type: ignore[method-assign]  # timed
+    sweep._wait = lambda: None if sweep._running else time.sleep(0.05)  # timed
     for name in ("claim", "_tell"):
         setattr(sweep, name, timed(getattr(sweep, name), parts[name].append))
     for name in ("should_prune", "report"):
@@ -107,7 +107,7 @@ def work(where: str, n_trials: int, begin: float) -> dict[str, Any]:
         numbers.append(running.trial.number)
         end(running, *args)
 
-    sweep._end = noted  # type: ignore[method-assign]  # timed
+    sweep._end = noted  # timed
     sys.stdout = open(os.devnull, "w")
     time.sleep(max(0.0, begin - time.time()))
     cpu, start = time.process_time(), time.perf_counter()

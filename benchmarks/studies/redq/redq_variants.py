@@ -111,7 +111,7 @@ class _OtherCritics(REDQPolicy):
     """A policy whose critics are other networks. They are fitted by plain autograd, as the fused passes do not know them."""
 
     # SB3 annotates its own class of critics, which the ensemble stands in for
-    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:  # type: ignore[override]
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> EnsembleCritic:
         critic = super().make_critic(features_extractor)
         hidden = hidden_layers(self.critic_kwargs["net_arch"], self.activation_fn, self.layer_norm, self.dropout_rate)
         critic.q_networks = self.networks(critic, hidden).to(self.device)
@@ -186,4 +186,4 @@ class REDQTD3(Symphony):
             members = np.random.permutation(self.n_critics)[: self.subset_size].tolist()
             return of_members(observations, actions, members)
 
-        self._regression.target_q_values = target_q_values  # type: ignore[method-assign,assignment]  # of this regression alone
+        self._regression.target_q_values = target_q_values  # of this regression alone
