@@ -294,7 +294,7 @@ def test_a_run_without_episodes_has_a_figure_too(tmp_path, figures):
         ("-max 1", "nothing to draw with -max 1"),
         ("--mean-per 100000", "nothing to draw with --mean-per 100000"),
         ("-y success", "does not tell whether an episode is a success"),
-        ("-o picture.bmp", "picture.bmp: expected a name that ends in .png, .svg, .pdf"),
+        ("-o picture.bmp", "--output: 'picture.bmp' — expected a file name that ends with .png or .svg or .pdf"),
         ("-o none/a.png", "there is no folder none"),
         ("-o /proc/a.png", "cannot be written"),
         ("-w 0", "episode_window: 0"),

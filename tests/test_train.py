@@ -153,8 +153,9 @@ def test_every_evaluation_uses_the_same_seeds(monkeypatch):
     reset = EpisodeSeeds.reset
 
     def record(self, **kwargs):
-        seen.append(self.first + self.episode)
-        return reset(self, **kwargs)
+        observation = reset(self, **kwargs)
+        seen.append(self.unwrapped.np_random_seed)
+        return observation
 
     monkeypatch.setattr(EpisodeSeeds, "reset", record)
     train(options(eval_freq=100, eval_episodes=3))
