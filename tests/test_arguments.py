@@ -7,9 +7,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import SAC, TD3
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_symphony import REDQ, DroQ, Symphony
@@ -515,8 +517,23 @@ def test_a_replay_buffer_of_more_environments(small, tmp_path):
     small(REDQ, n_envs=2).learn(30).save_replay_buffer(tmp_path / "buffer")
     model = small(REDQ)
     own = model.replay_buffer
-    with pytest.raises(ValueError, match="n_envs=1: the saved ReplayBuffer is of 2 environments"):
+    with pytest.raises(ValueError, match="n_envs=1: the saved ReplayBuffer is of 2"):
         model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is own
+
+
+def test_a_replay_buffer_of_another_task(small, tmp_path):
+    model = small(REDQ)
+    own = model.replay_buffer
+    other = spaces.Dict(x=model.observation_space)
+    save_to_pkl(tmp_path / "buffer.pkl", DictReplayBuffer(10, other, model.action_space))
+    with pytest.raises(ValueError, match=r"observation_space=Box.*: the saved DictReplayBuffer is of Dict"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    save_to_pkl(tmp_path / "buffer.pkl", {"not": "a buffer"})
+    with pytest.raises(ValueError, match=r"buffer\.pkl: .*ReplayBuffer"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    with pytest.raises(FileNotFoundError):
+        model.load_replay_buffer(tmp_path / "nothing")
     assert model.replay_buffer is own
 
 

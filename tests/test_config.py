@@ -375,6 +375,13 @@ def test_the_module_of_an_environment_is_no_part_of_its_name(tmp_path, monkeypat
     assert entry == {"n_timesteps": 2 if ":" in env else 1}
 
 
+@pytest.mark.parametrize("text", ["Hopper-v5: {gamma: 0.9}", "Own: {n_timesteps: 9}"])
+def test_a_file_without_the_environment(tmp_path, text):
+    (tmp_path / "own.yml").write_text(text)
+    with pytest.raises(ConfigError, match=r"own\.yml: no entry for 'Pendulum-v1'"):
+        find_entry(TrainOptions(algo="sac", env="Pendulum-v1", n_timesteps=5, conf_file=str(tmp_path / "own.yml")))
+
+
 @pytest.mark.parametrize("text", ["a: 1\nb: 2\na: 3", "x: {a: 1, a: 1}", "- {a: 1}\n- {1: a, 1: b}"])
 def test_keys_twice_are_refused(text):
     with pytest.raises(ConfigError, match="is there twice"):

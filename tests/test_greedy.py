@@ -224,6 +224,29 @@ def test_a_killed_run_goes_on_alike(algo, tmp_path):
     assert_same_results(whole, half)
 
 
+@pytest.mark.parametrize("first", [LENGTH + 1, LENGTH + 3, 2 * LENGTH])
+def test_learning_in_two_parts(first):
+    """An episode that has its noise back keeps it."""
+    seen = []
+    for parts in ([3 * LENGTH], [first, 3 * LENGTH - first]):
+        model, note = make("symphony", Fixed(falls=0), learning_starts=1), Note()
+        greedy = GreedyEpisodes(ALWAYS, (3, 9), stall_reward=0.4, stall_steps=2, n_episodes=1)
+        steps = []
+        for part in parts:
+            model.learn(part, callback=[greedy, note], reset_num_timesteps=model.num_timesteps == 0)
+            steps += note.seen
+        seen.append(steps)
+    assert seen[0] == seen[1] and len(seen[0]) == 3 * LENGTH
+
+
+def test_an_earlier_callback_does_not_count():
+    model, note = make("symphony", Fixed(), learning_starts=1), Note()
+    model.learn(LENGTH + 2, callback=GreedyEpisodes(ALWAYS, n_episodes=1))
+    assert model.greedy_envs.all()
+    model.learn(2, callback=note, reset_num_timesteps=False)
+    assert not any(each[0] for each in note.seen)
+
+
 def test_fresh_episodes_of_a_resumed_run(tmp_path):
     """The given-up episode was greedy until it stalled: its rewards do not count, and another one is greedy in its place."""
 

@@ -247,6 +247,17 @@ def test_a_changed_study_does_not_mix_with_old_results(whole, folder, capsys):
     assert contents(whole) == before
 
 
+def test_the_threshold_decides_which_evaluations_there_are(folder, capsys):
+    """Under the standard protocol those after it are fewer; that of the environment counts if none is given."""
+    parts = dict(algorithms=STUDY["algorithms"][:1], seeds=1, steps=120, final_episodes=0, protocol="standard")
+    own = write_study(folder, **parts, environments=[{"id": "Pendulum-v1", "threshold": -2000}])
+    assert main(["bench", str(own), "-f", "results"]) == 0
+    capsys.readouterr()
+    registered = write_study(folder, **parts, environments=["Pendulum-v1"])
+    message = fails(capsys, "bench", str(registered), "-f", "results", "--report")
+    assert "was trained with threshold -2000.0, the study has None" in message
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # What happens to it
 # ----------------------------------------------------------------------------------------------------------------------

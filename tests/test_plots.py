@@ -12,10 +12,10 @@ from matplotlib.text import Text
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis import plots
-from sb3_symphony.analysis.plots import block_mean, plot_training, running_mean, summarised
+from sb3_symphony.analysis.plots import block_mean, plot_scalars, plot_training, running_mean, scalar_curve, summarised
 from sb3_symphony.analysis.runs import open_run, read_scalars
 from sb3_symphony.analysis.statistics import bootstrap_interval, iqm
-from sb3_symphony.analysis.style import COLORS, save, spread
+from sb3_symphony.analysis.style import COLORS, line_style, save, spread
 from sb3_symphony.cli import main
 
 
@@ -110,14 +110,18 @@ def test_seeds_at_different_points_are_interpolated():
 
 def test_names_do_not_overlap():
     rng = np.random.default_rng(0)
-    np.testing.assert_array_equal(spread([0.9, 0.1, 0.5], 0.2), [0.9, 0.1, 0.5])  # nothing to do
-    np.testing.assert_allclose(spread([0.5, 0.5], 0.2), [0.4, 0.6])
+    np.testing.assert_allclose(spread([0.9, 0.1, 0.5], [0.2] * 3), [0.9, 0.1, 0.5])  # nothing to do
+    np.testing.assert_allclose(spread([0.5, 0.5], [0.2, 0.2]), [0.4, 0.6])
+    np.testing.assert_allclose(spread([0.5, 0.4, 3.0], [0.2, 0.6, 0.1]), [0.65, 0.25, 3.0])
     for _ in range(50):
-        wished = rng.random(6)
-        placed = spread(wished, 0.1)
-        assert (np.diff(np.sort(placed)) > 0.1 - 1e-9).all()
-        np.testing.assert_array_equal(np.argsort(placed), np.argsort(wished))
+        wished, sizes = rng.random(6), rng.uniform(0.05, 0.2, 6)
+        placed, order = spread(wished, sizes), np.argsort(wished)
+        assert (np.diff(placed[order]) > (sizes[order][1:] + sizes[order][:-1]) / 2 - 1e-9).all()
         assert placed.mean() == pytest.approx(wished.mean())
+
+
+def test_lines_differ():
+    assert len({(style["color"], style["linestyle"]) for style in map(line_style, range(42))}) == 42
 
 
 # ---------------------------------------------------------------- figures
@@ -211,6 +215,49 @@ def test_scalars(logs, figures, capsys):
     np.testing.assert_allclose(lines(figures[1].axes[0])[0][0][1], returns_of(logs, 1), rtol=1e-6)
 
 
+def test_panels_of_scalars_have_one_axis_of_time(figures, tmp_path):
+    def curve(label, hours):
+        return summarised(label, [(np.linspace(0, 3600 * hours, 60), np.sin(np.arange(60)))])
+
+    panels = {"train/approx_kl": [curve("ppo", 1.7)], "rollout/ep_rew_mean": [curve("ppo", 1.7), curve("sac", 10)]}
+    plot_scalars({**panels, **{f"train/{k}": [curve("sac", 10)] for k in range(2)}}, "time", tmp_path / "s.png", "X-v0")
+    axes = figures[0].axes
+    assert len({each.get_xlim() for each in axes}) == 1
+    assert {tuple(text.get_text() for text in each.get_xticklabels()) for each in axes} == {("0", "2", "4", "6", "8", "10")}
+    assert [each.get_xlabel() for each in axes] == ["", *["wall-clock time (hours)"] * 3]
+
+
+@pytest.mark.parametrize("n_panels, names", [(1, 5), (2, 12), (3, 5), (1, 1)])
+def test_names_of_scalars_are_all_to_be_seen(figures, tmp_path, n_panels, names):
+    line = (np.arange(9), np.arange(9))
+    labels = [f"algorithm learning_rate 0.0003, buffer_size {size}" for size in range(names)]
+    curves = [summarised(label, [line, line]) for label in labels]
+    plot_scalars({f"train/{k}": curves for k in range(n_panels)}, "steps", tmp_path / "s.png", "Pendulum-v1")
+    figure = figures[0]
+    figure.draw_without_rendering()
+    told = figure.legends[0].get_texts() if names > 1 else [figure._suptitle]
+    assert [" ".join(text.get_text().split()) for text in told] == (
+        [f"{label}, 2 seeds" for label in labels] if names > 1 else [f"Pendulum-v1: {labels[0]}, 2 seeds"]
+    )
+    boxes = [text.get_window_extent() for text in told] + [axes.get_tightbbox() for axes in figure.axes]
+    boxes += [each.get_title().get_window_extent() for each in figure.legends]
+    width, height = figure.get_size_inches() * figure.dpi
+    assert all(box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height for box in boxes)
+    assert boxes[0].count_overlaps(boxes[1:]) == boxes[-1].count_overlaps(boxes[:-1]) == 0
+
+
+def test_time_of_scalars_is_that_of_training(tmp_path, figures):
+    path = make_run(tmp_path, "sac", "X-v0", 1, np.arange(10.0))  # 100 steps a minute
+    with SummaryWriter(tmp_path / "tb") as writer:
+        for k in range(5):
+            writer.add_scalar("train/loss", k, 200 * k, walltime=1000.0 + 120 * k + 30_000 * (k > 2))  # a night between
+    (path / "X-v0" / "tensorboard.txt").write_text(str(tmp_path / "tb"))
+    x, _ = scalar_curve(open_run(path), "train/loss", "time")
+    np.testing.assert_allclose(x, [0, 120, 240, 360, 480])
+    x, _ = scalar_curve(open_run(tmp_path / "tb"), "train/loss", "time")  # the log alone does not know
+    np.testing.assert_allclose(np.diff(x), [120, 120, 30_120, 120])
+
+
 def test_numbers_as_json(logs, capsys):
     assert main(["plot", "-e", "X-v0", "-w", "1", "--json", "curves.json", "--quiet"]) == 0
     assert capsys.readouterr().out == ""
@@ -237,7 +284,8 @@ def test_names_are_no_formulas(logs, figures):
 
 
 def test_nothing_is_cut_off(logs, figures):
-    assert main(["plot", "-l", "a rather long name of a curve", "another name", "-e", "X-v0"]) == 0
+    names = ["a rather long name of a curve", "another name that is longer still than the first"]
+    assert main(["plot", "-l", *names, "-e", "X-v0"]) == 0
     figure = figures[0]
     figure.draw_without_rendering()
     width, height = figure.get_size_inches() * figure.dpi
@@ -245,6 +293,9 @@ def test_nothing_is_cut_off(logs, figures):
         for text in axes.texts:
             box = text.get_window_extent()
             assert box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height
+        assert axes.get_window_extent().width > width / 2
+        first, *others = (text.get_window_extent() for text in axes.texts)
+        assert first.count_overlaps(others) == 0
 
 
 # ---------------------------------------------------------------- the figure of a run

@@ -283,6 +283,17 @@ def test_custom_objects(make, algorithm, tmp_path):
     assert loaded.actor.optimizer.param_groups[0]["lr"] == 1e-5
 
 
+def test_policy_kwargs_as_custom_objects(make, algorithm, tmp_path):
+    """Those of the user, without what the constructor has added to them."""
+    model = make(n_critics=3).learn(40)
+    model.save(tmp_path / "model")
+    own = {name: value for name, value in model.policy_kwargs.items() if name not in ("n_critics", "use_sde")}
+    loaded = algorithm.load(tmp_path / "model", custom_objects=dict(policy_kwargs=own))
+    assert loaded.critic.n_critics == 3 and "n_critics" not in own
+    with pytest.raises(ValueError, match="n_critics=3: the saved model has 4"):
+        algorithm.load(tmp_path / "model", custom_objects=dict(policy_kwargs={**own, "n_critics": 4}))
+
+
 def test_arguments_given_to_load(make, algorithm, tmp_path):
     model = make().learn(40)
     model.save(tmp_path / "model")

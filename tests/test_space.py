@@ -136,6 +136,21 @@ def test_what_the_command_line_gives_is_not_searched(tmp_path):
     assert set(space.parameters) == {"gamma"} and space.fixed == {}
 
 
+@pytest.mark.parametrize(
+    "given, searched",
+    [
+        ({"policy_kwargs": {"net_arch": [8]}}, {"gamma"}),
+        ({"policy_kwargs.net_arch": [8]}, {"gamma", "policy_kwargs.n_critics"}),
+        ({"policy_kwargs_": 1}, {"gamma", "policy_kwargs.net_arch", "policy_kwargs.n_critics"}),
+    ],
+)
+def test_mappings_that_the_command_line_gives(tmp_path, given, searched):
+    text = "gamma: [0.9, 0.99]\npolicy_kwargs.net_arch: [[16], [32]]\npolicy_kwargs.n_critics: [1, 2]\n"
+    assert set(written(tmp_path, text, hyperparams=given).parameters) == searched
+    with pytest.raises(ConfigError, match="nothing is left to search"):
+        written(tmp_path, "policy_kwargs: [{net_arch: [16]}, {}]\n", hyperparams={"policy_kwargs.net_arch": [8]})
+
+
 def test_missing_file():
     with pytest.raises(ConfigError, match="no such file"):
         read_space(TuneOptions(space="nowhere.yml"))

@@ -284,6 +284,16 @@ def test_algorithms_of_a_file(write, tmp_path):
         ({"figures": {"x": {"algorithms": ["td4"]}}}, "figures: x: algorithms: unknown name 'td4': did you mean 'td3'?"),
         ({"figures": {"x": {"x_axis": "days"}}}, "x_axis: 'days'"),
         ({"figures": {"x": {"json_file": "a.json"}}}, "figures: 'json_file' — is for the command line"),
+        ({"figures": {"x": {"tags": ["train/loss"]}}}, "figures: x: scalars are those of TensorBoard logs"),
+        ({"figures": {"x": {"gait_at": 3, "tags": ["a"]}}}, "figures: gait_at: 3 — is a figure of its own, expected no tags"),
+        (
+            {"figures": {"x": {"evaluations": True}}, "protocol": {"eval_freq": 0}},
+            "figures: x: evaluations — expected a protocol with eval_freq > 0",
+        ),
+        (
+            {"algorithms": [{"name": "td3", "reported": {"Pendulum-v0": "3"}}], "environments": ["Pendulum-v1"]},
+            "algorithms: td3: reported: unknown name 'Pendulum-v0': did you mean 'Pendulum-v1'?",
+        ),
         ({"figures": {"x": {"mean_per": 10, "evaluations": True}}}, "figures: --mean-per: 10 — is for training episodes"),
         (
             {

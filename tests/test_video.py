@@ -170,6 +170,15 @@ def test_gif(model):
     assert total == 1500
 
 
+@pytest.mark.parametrize("fps, durations", [(30, [30, 40, 30] * 2), (50, [20] * 6), (12.5, [80] * 6)])
+def test_gifs_run_in_real_time(tmp_path, fps, durations):
+    pictures = [np.full((20, 20, 3), 40 * k, dtype=np.uint8) for k in range(6)]
+    assert write_film(pictures, fps, tmp_path / "a.gif") == 6
+    with Image.open(tmp_path / "a.gif") as film:
+        told = [(film.seek(index), film.info["duration"])[1] for index in range(film.n_frames)]
+    assert told == durations
+
+
 def test_grid(model):
     argv = [
         "video",
@@ -262,6 +271,7 @@ def test_mujoco(tmp_path, monkeypatch):
         ("-o a.avi", "expected a file name that ends with .mp4 or .gif"),
         ("-o nowhere/a.mp4", "there is no folder nowhere"),
         ("--fps 0", "fps: 0"),
+        ("--fps 60 -o a.gif", "--fps: 60 — expected at most 50 for a.gif, or an .mp4"),
         ("--width 10", "width: 10"),
         ("-n 0", "n_timesteps: 0"),
         ("--n-episodes 0", "n_episodes: 0"),

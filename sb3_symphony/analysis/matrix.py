@@ -95,13 +95,15 @@ def plot_matrix(results: Sequence[Result], names: Sequence[str], label: str, out
         figure = new_figure(10.4, max(3.4, 0.42 * len(rows) + 2))
         _draw(figure, rows, names, label)
         note(figure, "mean return of the final models' episodes, deterministic; bars: standard deviation over episodes")
-        ends = [(name, _end(entries), line_style(i)["color"]) for i, (name, entries) in enumerate(rows.items())]
+        last = np.argsort(positions(names), kind="stable")
+        ends = [(name, _end(entries, last), line_style(i)["color"]) for i, (name, entries) in enumerate(rows.items())]
         name_lines(figure, figure.axes[1], ends)
         return save(figure, output)
 
 
-def _end(entries: Sequence[np.ndarray | None]) -> float:
-    return float([each.mean() for each in entries if each is not None][-1])
+def _end(entries: Sequence[np.ndarray | None], order: np.ndarray) -> float:
+    """Mean of the right-most one that there is."""
+    return float([each.mean() for i in order if (each := entries[i]) is not None][-1])
 
 
 def _draw(figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Sequence[str], label: str) -> None:
@@ -121,8 +123,8 @@ def _draw(figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Seque
 
     at = positions(names)
     for index, entries in enumerate(rows.values()):
-        known = [i for i, each in enumerate(entries) if each is not None]
-        spread = [each.std() for each in entries if each is not None]
+        known = [i for i in np.argsort(at, kind="stable") if entries[i] is not None]
+        spread = [each.std() for i in known if (each := entries[i]) is not None]
         style = line_style(index)
         lines.errorbar(at[known], means[index, known], spread, **style, marker="o", markersize=3, elinewidth=0.6, capsize=2)
     lines.set_xticks(at, names)

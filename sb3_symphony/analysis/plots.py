@@ -7,6 +7,7 @@ and the IQM ends where the shortest one ends.
 """
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from sb3_symphony.analysis.runs import NotRecorded, Run, open_run
@@ -218,7 +220,8 @@ def scalar_curve(run: Run, tag: str, x: XAxis, max_steps: int | None = None) -> 
     if tag not in run.scalars:
         raise NotRecorded(f"{run.path}: has not logged {tag!r}{suggestion(tag, run.scalars)}")
     scalar = run.scalars[tag]
-    at = scalar.seconds if x == "time" else _located(run, scalar.steps, x)
+    # A log's own clock goes on while a run is stopped
+    at = scalar.seconds if x == "time" and run.episodes is None else _located(run, scalar.steps, x)
     kept = np.isfinite(scalar.values) & (scalar.steps <= (math.inf if max_steps is None else max_steps))
     return at[kept], scalar.values[kept]
 
@@ -244,10 +247,10 @@ def _name(curve: Curve) -> str:
     return curve.label if n == 1 else f"{curve.label}, {n} seeds"
 
 
-def _scale_x(axes: Axes, x: XAxis) -> None:
-    """Label, unit and limits of the x axis. Curves hold seconds; the ticks say hours, minutes or seconds."""
+def _scale_x(axes: Axes, x: XAxis, right: float | None = None) -> None:
+    """Label, unit and limits of the x axis, to its data or a given end. Curves hold seconds; ticks say hours, minutes or s."""
     axes.margins(x=0.02)  # room for half a marker
-    axes.set_xlim(left=0)
+    axes.set_xlim(0, right)
     if x == "time":
         right = axes.get_xlim()[1]
         unit, size = next((u, s) for u, s in (("hours", 3600), ("minutes", 60), ("seconds", 1)) if right >= 2 * s or s == 1)
@@ -331,29 +334,45 @@ def plot_scalars(panels: dict[str, list[Curve]], x: XAxis, output: Path, title: 
         every = [curve for curves in panels.values() for curve in curves]
         names = {curve.label: _name(curve) for curve in every}
         labels = list(names)
-        for number, (axes, (tag, curves)) in enumerate(zip(grid.flat, panels.items(), strict=False)):
+        for axes, (tag, curves) in zip(grid.flat, panels.items(), strict=False):
             for curve in curves:
                 _draw(axes, curve, labels.index(curve.label))
             name, unit = SCALARS.get(tag, (tag, ""))
             axes.set_title(name)
             axes.set_ylabel(unit)
-            _scale_x(axes, x)
-            if number < len(panels) - columns:
-                axes.set_xlabel("")  # said below, in the same column
+            axes.margins(x=0.02)
         for axes in grid.flat[len(panels) :]:
             axes.remove()
         right = max(axes.get_xlim()[1] for axes in figure.axes)
-        for axes in figure.axes:
-            axes.set_xlim(0, right)
-        figure.suptitle(title if len(labels) > 1 else f"{title}: {names[labels[0]]}", fontsize=9, x=0.01, ha="left")
-        handles = {line.get_label(): line for axes in figure.axes for line in axes.lines if line.get_label() in names}
+        for number, axes in enumerate(figure.axes):
+            _scale_x(axes, x, right)
+            if number < len(panels) - columns:
+                axes.set_xlabel("")  # said below, in the same column
         if len(labels) > 1:
-            shown = [handles[label] for label in labels]
-            legend = figure.legend(shown, names.values(), loc="outside upper right", ncols=len(labels))
-            for text, label in zip(legend.get_texts(), labels, strict=True):
-                text.set_color(line_style(labels.index(label))["color"])
+            _legend(figure, names, title)
+        else:
+            heading = _folded(figure, f"{title}: {names[labels[0]]}")
+            figure.suptitle(heading, fontsize=9, x=0.01, ha="left")
         note(figure, _explained(every, ""))
         return save(figure, output)
+
+
+def _legend(figure: Figure, names: dict[str, str], title: str) -> None:
+    """Heading and names of all lines above the panels, in as many columns as there is room for."""
+    handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+    lines = [handles[label] for label in names]
+    texts = [_folded(figure, name) for name in names.values()]
+    for columns in range(len(names), 0, -1):
+        legend = figure.legend(lines, texts, loc="outside upper left", ncols=columns, title=title, alignment="left")
+        if columns == 1 or legend.get_window_extent().width < figure.bbox.width:
+            break
+        legend.remove()
+    for number, text in enumerate(legend.get_texts()):
+        text.set_color(line_style(number)["color"])
+
+
+def _folded(figure: Figure, text: str) -> str:
+    return textwrap.fill(text, int(figure.get_figwidth() * 14))  # letters of this size in a line
 
 
 def _title(run: Run) -> str:

@@ -18,7 +18,7 @@ from sb3_symphony.common.files import completed
 #: Okabe and Ito's colours, the light ones darkened so that text in them is readable on white
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#A8467F", "#000000", "#B27500", "#2E8BBF")
 #: told apart in greyscale too
-DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)), (0, (3, 1, 1, 1, 1, 1)), "-")
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)), (0, (3, 1, 1, 1, 1, 1)))
 GREY = "#555555"
 SUFFIXES = (".png", ".svg", ".pdf")
 
@@ -83,7 +83,7 @@ def save(figure: Figure, output: Path) -> Path:
 def line_style(index: int) -> dict[str, Any]:
     """
     :param index: of a group of runs, from 0 on
-    :return: colour and dashes
+    :return: colour and dashes, of which there are 42 pairs
     """
     return {"color": next(islice(cycle(COLORS), index, None)), "linestyle": next(islice(cycle(DASHES), index, None))}
 
@@ -99,33 +99,32 @@ def note(figure: Figure, text: str) -> None:
     figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=7.5, color=GREY)
 
 
-def spread(positions: Sequence[float], gap: float) -> np.ndarray:
+def spread(positions: Sequence[float], sizes: Sequence[float]) -> np.ndarray:
     """
-    Move positions apart as little as needed, keeping their order.
+    Move things along a line apart as little as needed (least squares), keeping their order.
 
-    :param positions: shape ``(n,)``
-    :param gap: least distance between two of them
+    :param positions: their middles, shape ``(n,)``
+    :param sizes: their extents, shape ``(n,)``
     :return: new positions, shape ``(n,)``
     """
     order = np.argsort(positions, kind="stable")
-    placed = np.array(positions, dtype=float)[order]
-    clusters: list[tuple[float, list[float]]] = []  # where the first stands, and the wishes of its members minus their rank
-    for wish in placed:
-        first, members = wish, [wish]
-        while clusters and clusters[-1][0] + len(clusters[-1][1]) * gap > first:
-            _, before = clusters.pop()
-            members = [*before, *(member - len(before) * gap for member in members)]
-            first = float(np.mean(members))
-        clusters.append((first, members))
-    placed = np.concatenate([first + gap * np.arange(len(members)) for first, members in clusters]) if clusters else placed
-    result = np.empty_like(placed)
-    result[order] = placed
+    extents = np.array(sizes, dtype=float)[order]
+    offsets = np.cumsum(extents) - extents / 2
+    # What is left of a position without all that comes before may not fall: neighbours where it does are averaged
+    clusters: list[list[float]] = []
+    for wish in np.array(positions, dtype=float)[order] - offsets:
+        clusters.append([wish])
+        while len(clusters) > 1 and np.mean(clusters[-2]) > np.mean(clusters[-1]):
+            last = clusters.pop()
+            clusters[-1] += last
+    result = np.empty_like(offsets)
+    result[order] = offsets + [float(np.mean(cluster)) for cluster in clusters for _ in cluster]
     return result
 
 
 def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, str]]) -> None:
     """
-    Write names at the right of a panel, each at the height where its line ends.
+    Write names at the right of a panel, each at the height where its line ends; long ones in several lines.
 
     :param figure: the figure
     :param axes: the panel, everything drawn
@@ -138,9 +137,10 @@ def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, str]
     size = 8.5
     height = axes.get_window_extent().height * 72 / figure.dpi
     wished = [float(to_axes.transform((0.0, value))[1]) for _, value, _ in ends]
-    gap = size * 1.25 / height
-    placed = spread([min(max(at, 0.0), 1.0) for at in wished], gap)
-    for (text, _, color), at in zip(ends, placed, strict=True):
+    names = [text if "\n" in text else textwrap.fill(text, 24) for text, _, _ in ends]
+    sizes = [(1 + text.count("\n")) * size * 1.25 / height for text in names]
+    placed = spread([min(max(at, 0.0), 1.0) for at in wished], sizes)
+    for text, (_, _, color), at in zip(names, ends, placed, strict=True):
         axes.annotate(
             text,
             (1.0, at),

@@ -241,9 +241,11 @@ class GreedyEpisodes(_OnReturn):
         self.in_row = in_row
         self.stall_reward = stall_reward
         self.stall_steps = stall_steps
-        # Of each environment the latest rewards of its episode, and how many greedy episodes there were in a row
+        # Of each environment the latest rewards of its episode, how many greedy episodes there were in a row, and whether
+        # it acts greedily now
         self.rewards: list[deque[float]] = []
         self.row: list[int] = []
+        self.greedy = np.zeros(0, dtype=bool)  # (n_envs,)
 
     def _init_callback(self) -> None:
         super()._init_callback()
@@ -251,15 +253,20 @@ class GreedyEpisodes(_OnReturn):
             raise TypeError(f"model: expected one with greedy episodes, such as Symphony, got {type(self.model).__name__}")
 
     def _on_training_start(self) -> None:
-        if self.num_timesteps == 0 or len(self.row) != self.training_env.num_envs:  # else episodes go on
+        model: Any = self.model
+        unknown = self.num_timesteps == 0 or len(self.row) != self.training_env.num_envs
+        if unknown:
             self.row = [0] * self.training_env.num_envs
-        self.start_anew()
+        if unknown or model.resets_envs:
+            self.start_anew()
+        model.greedy_envs = self.greedy
 
     def start_anew(self) -> None:
         """Episodes begin that none has ended before: they are of the kind that those given up were meant to be."""
         model: Any = self.model
         self.rewards = [deque(maxlen=self.stall_steps) for _ in self.row]
-        model.greedy_envs = np.array(self.row) > 0  # (n_envs,)
+        self.greedy = np.array(self.row) > 0
+        model.greedy_envs = self.greedy
 
     def _on_step(self) -> bool:
         model: Any = self.model
@@ -272,9 +279,10 @@ class GreedyEpisodes(_OnReturn):
                 self.rewards[i].clear()
                 wanted = self._wanted(info) if model.num_timesteps >= model.learning_starts else 0
                 self.row[i] = self.row[i] + 1 if self.row[i] < wanted else 0
-                model.greedy_envs[i] = self.row[i] > 0
+                self.greedy[i] = self.row[i] > 0
             elif self.stall_reward is not None and len(self.rewards[i]) == self.stall_steps:
-                model.greedy_envs[i] &= np.mean(self.rewards[i]) >= self.stall_reward
+                self.greedy[i] &= np.mean(self.rewards[i]) >= self.stall_reward
+        model.greedy_envs = self.greedy
         return True
 
     def _wanted(self, info: dict[str, Any]) -> int:

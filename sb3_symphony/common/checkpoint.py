@@ -297,7 +297,8 @@ class ExactCheckpoints(BaseCallback):
         """
         Write a checkpoint. If that fails, for example because the disk is full, older ones are left as they are.
 
-        :param rollout_follows: False after training, when the start of a next rollout is still to come
+        :param rollout_follows: False after training, when the start of a next rollout is still to come; then only if
+            training has come to the end of one (``finished``), not if a callback has stopped it before
         :return: whether it was written
         """
         model, steps = self.model, self.model.num_timesteps

@@ -211,7 +211,7 @@ class EnsembleCritic(BaseModel):
         :param obs: Observations ``(batch, ...)``
         :param actions: Actions in [-1, 1] ``(batch, action_dim)``
         :param members: Indices of the critics to compute, all of them by default
-        :return: ``(n_critics, batch, 1)``
+        :return: ``(n_critics, batch, 1)``, where SB3's critics give a tuple of ``(batch, 1)``
         """
         outputs = self.outputs(obs, actions, members)
         return outputs if self.bins is None else self.bins.values(outputs)

@@ -56,10 +56,14 @@ class ActsGreedily(OffPolicyAlgorithm):
     """
 
     greedy_envs: np.ndarray | None = None  # bool (n_envs,); None: none of them
+    resets_envs = True  # whether the latest learn() began with new episodes, or went on in those of the one before
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> Any:
-        self.greedy_envs = None  # of a saved model, whose callback may not be there any more
-        return super()._setup_learn(*args, **kwargs)
+    def _setup_learn(
+        self, total_timesteps: int, callback: MaybeCallback = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
+    ) -> Any:
+        self.greedy_envs = None  # of an earlier learn(), whose callback may not be there any more
+        self.resets_envs = reset_num_timesteps or self._last_obs is None  # as SB3 decides it; some return the same array again
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -164,6 +168,9 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         check_choice("critic_loss", self.critic_loss, (*CRITIC_LOSSES, CLASSIFICATION))
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
         self._check_classification()
+        # Those that load() got as one of its custom_objects are without what the constructor has added to them
+        added = {"n_critics": self.n_critics, **({"use_sde": True} if self.use_sde else {})}
+        self.policy_kwargs = {**added, **self.policy_kwargs}
         for name in ("n_critics", "use_sde"):
             built = self.policy_kwargs.get(name, False)
             if getattr(self, name) != built:
@@ -263,9 +270,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             if isinstance(each, DecayingActionNoise):
                 each.n_envs = self.env.num_envs  # a decay counts environment steps
         check_mirror(self.replay_buffer, self._vec_normalize_env)  # now, not after the warm-up
-        resets = reset_num_timesteps or self._last_obs is None  # as SB3 decides it; some return the same array again
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
-        if resets:
+        if self.resets_envs:
             self.start_anew()
         self._timesteps_at_update = min(self._timesteps_at_update, self.num_timesteps)  # whose count may have restarted
         return result
@@ -497,25 +503,33 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         priorities) stays what was saved, whatever ``replay_buffer_class`` and ``replay_buffer_kwargs`` say.
 
         :param truncate_last_traj: Whether the buffer's last episode ends there; else it is the one that the model is in
-        :raises ValueError: if the buffer is of another number of environments, or has no n-step returns and the model needs
-            them; the model's own buffer then stays
+        :raises ValueError: if the file holds no replay buffer, or one of other spaces, of another number of environments, or
+            without n-step returns where the model needs them; the model's own buffer then stays
         """
         before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        loaded = self.replay_buffer
-        assert loaded is not None
-        if loaded.n_envs != self.n_envs:
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            self._check_loaded_buffer()
+        except BaseException as error:
             self.replay_buffer = before
-            raise ValueError(f"n_envs={self.n_envs}: the saved {type(loaded).__name__} is of {loaded.n_envs} environments")
+            if isinstance(error, AssertionError):  # SB3 asserts what is a user's error: what the file holds
+                raise ValueError(f"{path}: {error}") from error
+            raise
+        loaded: Any = self.replay_buffer
         if isinstance(loaded, NStepReplayBuffer):
             loaded.n_steps, loaded.gamma = self.n_steps, self.gamma
-        elif self.n_steps > 1:
-            self.replay_buffer = before
-            raise ValueError(
-                f"n_steps={self.n_steps}: the saved {type(loaded).__name__} has no n-step returns, expected n_steps=1"
-            )
         if truncate_last_traj and not isinstance(loaded, HerReplayBuffer):  # for HER, SB3 does it
             end_trajectory(loaded)
+
+    def _check_loaded_buffer(self) -> None:
+        loaded: Any = self.replay_buffer
+        kind = type(loaded).__name__
+        for name in ("observation_space", "action_space", "n_envs"):
+            wanted, there = getattr(self, name), getattr(loaded, name)
+            if there != wanted:
+                raise ValueError(f"{name}={wanted!r}: the saved {kind} is of {there!r}")
+        if self.n_steps > 1 and not isinstance(loaded, NStepReplayBuffer):
+            raise ValueError(f"n_steps={self.n_steps}: the saved {kind} has no n-step returns, expected n_steps=1")
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression", "_recordings"]

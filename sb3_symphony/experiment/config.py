@@ -9,6 +9,7 @@ Stable-Baselines3.
 
 import ast
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -385,6 +386,15 @@ def entry_name(content: Mapping[str, Any], env: str, path: Path) -> str | None:
     return name
 
 
+def has_entries(content: Mapping[str, Any]) -> bool:
+    """
+    :param content: content of a YAML file
+    :return: whether it has entries of environments: keys as no hyper-parameter has, or all of them with settings below
+    """
+    named = any(re.search(r"-v\d+$", str(key)) for key in content)
+    return named or (bool(content) and all(isinstance(value, dict) and "n_timesteps" in value for value in content.values()))
+
+
 def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
     """
     Look up the environment's entry, else ``default``, in the given file or preset or the shipped file; a flat file is its own.
@@ -408,7 +418,7 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
         if not isinstance(content[name], dict):
             raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")
         return f"{path.name}, {name}" if options.conf_file is None else f"-conf {path}, {name}", content[name]
-    if content and all(isinstance(value, dict) and "n_timesteps" in value for value in content.values()):
+    if has_entries(content):
         raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     return f"-conf {path}", content
 

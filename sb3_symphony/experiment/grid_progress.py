@@ -147,12 +147,15 @@ def _check_conditions(progress: Progress, result: dict[str, Any]) -> None:
 
 def _check_same(progress: Progress) -> None:
     """Refuse to mix runs of one study with those of another, or of the same one before it was changed."""
+    from sb3_symphony.experiment.protocol import reward_threshold
+
     run, cell = progress.run, progress.cell
     stored = {"options": read_yaml(run.details / "args.yml"), "config": read_yaml(run.details / "config.yml")}
     options = {name: getattr(cell.options, name) for name in _DECISIVE}
-    if cell.options.protocol is not None:  # settles these; the threshold too, if none is given
-        for name in ("eval_freq", "eval_episodes", *(["threshold"] if cell.options.threshold is None else [])):
-            del options[name]
+    if cell.options.protocol is not None:
+        del options["eval_freq"], options["eval_episodes"]  # the protocol settles these
+        if options["threshold"] is None:
+            options["threshold"] = reward_threshold(cell.options.env)
     config = parse_yaml(yaml.safe_dump(progress.config.plain), "study")
     pairs = [(name, stored["options"].get(name), value) for name, value in options.items() if name != "algo"]
     pairs.append(("algo", without_folder(str(stored["options"].get("algo"))), without_folder(cell.options.algo)))

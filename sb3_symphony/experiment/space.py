@@ -13,8 +13,7 @@ Neither torch nor Optuna is imported here.
 
 import json
 import math
-import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -23,7 +22,15 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from sb3_symphony.common.checks import suggestion
-from sb3_symphony.experiment.config import ConfigError, Threads, TrainOptions, entry_name, read_yaml, shipped_folder
+from sb3_symphony.experiment.config import (
+    ConfigError,
+    Threads,
+    TrainOptions,
+    entry_name,
+    has_entries,
+    read_yaml,
+    shipped_folder,
+)
 from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.run_folder import RunFolder
 
@@ -302,17 +309,22 @@ def read_space(options: TuneOptions) -> SearchSpace:
     name = entry_name(content, options.env, path)
     if name is not None:
         where, content = f"{path}: {name}", content[name]
-    elif any(re.search(r"-v\d+$", str(key)) for key in content):  # no hyper-parameter ends like that
+    elif has_entries(content):
         raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     space = parse_space(content, where)
-    given = {*options.hyperparams, *(["n_timesteps"] if options.n_timesteps > 0 else [])}
-    parameters = {name: parameter for name, parameter in space.parameters.items() if name not in given}
+    given = [*options.hyperparams, *(["n_timesteps"] if options.n_timesteps > 0 else [])]
+    parameters = {name: parameter for name, parameter in space.parameters.items() if not _covered(name, given)}
     if not parameters:
         raise ConfigError(
             f"{where}: nothing is left to search — expected a hyper-parameter with more than one choice that -params "
             "and -n do not give"
         )
-    return SearchSpace(where, parameters, {name: value for name, value in space.fixed.items() if name not in given})
+    return SearchSpace(where, parameters, {name: value for name, value in space.fixed.items() if not _covered(name, given)})
+
+
+def _covered(name: str, given: Iterable[str]) -> bool:
+    """Whether something given is this hyper-parameter, the mapping that it is in, or an item of it."""
+    return any(name == other or name.startswith(f"{other}.") or other.startswith(f"{name}.") for other in given)
 
 
 def parse_space(content: Any, where: str) -> SearchSpace:

@@ -296,6 +296,9 @@ def _figure(options: Any) -> "Drawing":
     _settled(options, _NOT_OF_FIGURES, "; a figure has algorithms and environments of the study")
     drawing: Drawing = _part(Drawing, None, options)
     check_options(drawing)
+    beside = sorted(drawing.model_fields_set - {"algorithms", "environments", "gait_at"})
+    if drawing.gait_at is not None and beside:
+        raise ConfigError(f"gait_at: {drawing.gait_at} — is a figure of its own, expected no {beside[0]}")
     return drawing
 
 
@@ -459,9 +462,19 @@ def _check(study: Study, folder: Path) -> None:
             if missing:
                 raise ConfigError(f"{where}: {source.name} has no seed {min(missing)}")
         algorithms[each.name] = each
+        if isinstance(each.reported, dict):
+            _chosen(f"algorithms: {each.name}: reported", each.reported, environments)
+    _check_figures(study, algorithms, environments)
+
+
+def _check_figures(study: Study, algorithms: Mapping[str, Algorithm], environments: Mapping[str, Environment]) -> None:
     for name, figure in study.figures.items():
         _chosen(f"figures: {name}: algorithms", figure.algorithms, algorithms)
         _chosen(f"figures: {name}: environments", figure.environments, environments)
+        if figure.kind == "scalars" and not study.tensorboard:
+            raise ConfigError(f"figures: {name}: scalars are those of TensorBoard logs — expected tensorboard: true")
+        if figure.kind == "evaluations" and study.protocol != "standard" and study.protocol.eval_freq <= 0:
+            raise ConfigError(f"figures: {name}: evaluations — expected a protocol with eval_freq > 0")
 
 
 def _algo(algorithm: Algorithm, folder: Path) -> str:

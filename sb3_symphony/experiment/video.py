@@ -34,6 +34,7 @@ from sb3_symphony.experiment.select import AgentsOptions, Selection, SelectOptio
 
 SUFFIXES = (".mp4", ".gif")
 _HOLD = 1.0  # seconds that the last picture stays
+_GIF_FPS = 50  # the most that the format's clock can do, in hundredths of a second, and players keep up with
 _GAP = 4  # pixels between the agents of a grid
 
 
@@ -340,11 +341,14 @@ def _write_gif(pictures: Iterable[np.ndarray], fps: float, output: Path) -> int:
     def images() -> Iterator[Image.Image]:
         nonlocal count
         for picture in pictures:
+            image = Image.fromarray(picture).quantize(dither=Image.Dither.NONE)
+            # In hundredths of a second, of which some rates need 3, 3, 4, …
+            image.info["duration"] = 10 * (round(100 * (count + 1) / fps) - round(100 * count / fps))
             count += 1
-            yield Image.fromarray(picture).quantize(dither=Image.Dither.NONE)
+            yield image
 
     film = images()
-    next(film).save(output, save_all=True, append_images=film, duration=1000 / fps, loop=0)
+    next(film).save(output, save_all=True, append_images=film, loop=0)
     return count
 
 
@@ -380,6 +384,8 @@ def video(options: VideoOptions) -> list[Path]:
                 check_folder(output.parent, "--output")
             if output.suffix.lower() == ".mp4":
                 _check_ffmpeg(output)
+            elif options.fps is not None and options.fps > _GIF_FPS:
+                raise ConfigError(f"--fps: {options.fps} — expected at most {_GIF_FPS} for {output}, or an .mp4")
             if output in outputs:
                 raise ConfigError(f"'{output}' would be the film of two agents — expected each agent once, or --grid")
             outputs.append(output)

@@ -45,7 +45,8 @@ class REDQPolicy(EnsemblePolicy, SACPolicy):
     :param n_bins: Their number of bins
     :param critic_engine: How the critics are fitted: ``"fused"`` by hand-written passes, ``"autograd"``, or ``"auto"``,
         fused wherever it is possible; the results are equal up to rounding. ``"bf16"`` is fused with large products in
-        bfloat16: less precise, and up to 1.6 times as fast where networks are large and the processor has it
+        bfloat16: less precise, and up to 1.6 times as fast where networks are large and the processor has it. What only
+        autograd knows of a built model (hooks, frozen layers, another optimizer) is left to it, whatever stands here
     :param actor_averaging: Above 0, ``predict(..., deterministic=True)`` asks an average of the actor's weights over about
         this part of its updates so far (0.125: the last eighth); training is the same without, but for ``GreedyEpisodes``
     """
