@@ -231,6 +231,14 @@ def test_groups_are_named_apart(tmp_path):
     assert [group.label for group in groups] == ["sac 1 (a/sac/X-v0_1)", "sac 1 (b/sac/X-v0_1)", "td3"]
 
 
+def test_logs_without_settings_are_no_seeds_of_each_other(tmp_path):
+    for number in (1, 2):
+        with SummaryWriter(tmp_path / "tb" / f"PPO_{number}") as writer:
+            writer.add_scalar("train/loss", 1.0, 0)
+    groups = group_runs(open_run(tmp_path / "tb" / f"PPO_{number}") for number in (1, 2))
+    assert [(group.label, len(group.runs)) for group in groups] == [("ppo (PPO_1)", 1), ("ppo (PPO_2)", 1)]
+
+
 def test_runs_that_start_elsewhere_are_another_group(tmp_path):
     paths = [make_run(tmp_path, number=k, seed=k, gamma=0.9) for k in range(1, 6)]
     for path, options in zip(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from sb3_symphony.analysis import matrix as matrix_module
 from sb3_symphony.analysis.matrix import matrix_rows, matrix_table, plot_matrix, positions
 from sb3_symphony.analysis.runs import open_run
 from sb3_symphony.analysis.tables import (
@@ -254,6 +255,19 @@ def test_matrix(matrix, tmp_path):
     output = tmp_path / "matrix.png"
     assert plot_matrix(matrix, names, "mass (kg)", output) == output and output.stat().st_size > 10_000
     assert plot_matrix(matrix[3:], names, "mass (kg)", output) is None and not output.exists()  # nothing to draw any more
+
+
+def test_lines_of_a_matrix_go_to_the_right(matrix, tmp_path, monkeypatch):
+    """Also if the study's conditions do not rise; the name stands where the line ends."""
+    drawn = []
+    monkeypatch.setattr(matrix_module, "save", lambda figure, output: drawn.append(figure))
+    plot_matrix(matrix[:2], ["4", "10", "2"], "mass (kg)", tmp_path / "matrix.png")
+    _, lines = drawn[0].axes
+    x, y = lines.lines[0].get_data()
+    assert x.tolist() == [2, 4, 10] and y.tolist() == [4, 15, 100]
+    (name,) = lines.texts
+    _, end = (lines.transData + lines.transAxes.inverted()).transform((10, 100))
+    assert name.get_text() == "a" and name.xy[1] == pytest.approx(end)
 
 
 def test_places_of_conditions():

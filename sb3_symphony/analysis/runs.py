@@ -345,7 +345,7 @@ def told_apart(run: Run) -> dict[str, Any]:
 
 def group_runs(runs: Iterable[Run]) -> list[Group]:
     """
-    Put runs together that differ in seed and length only.
+    Put runs together that differ in seed and length only; what has no settings on record may differ in anything.
 
     Groups of the same algorithm and environment are told apart by up to two hyper-parameters that differ, if their values
     are short, else by the numbers of their folders, and by their paths if these are the same.
@@ -359,7 +359,7 @@ def group_runs(runs: Iterable[Run]) -> list[Group]:
         own = {key: value for key, value in _flat(run.config).items() if key != "n_timesteps"}
         own |= {name: str(value) for name, value in told_apart(run).items() if value}
         for group, setting in zip(groups, settings, strict=True):
-            if (group.label, group.env, setting) == (run.algo, run.env, own):
+            if run.config and (group.label, group.env, setting) == (run.algo, run.env, own):
                 group.runs.append(run)
                 break
         else:
