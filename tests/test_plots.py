@@ -112,12 +112,19 @@ def test_names_do_not_overlap():
     rng = np.random.default_rng(0)
     np.testing.assert_allclose(spread([0.9, 0.1, 0.5], [0.2] * 3), [0.9, 0.1, 0.5])  # nothing to do
     np.testing.assert_allclose(spread([0.5, 0.5], [0.2, 0.2]), [0.4, 0.6])
-    np.testing.assert_allclose(spread([0.5, 0.4, 3.0], [0.2, 0.6, 0.1]), [0.65, 0.25, 3.0])
+    np.testing.assert_allclose(spread([0.5, 0.4], [0.1, 0.3]), [0.55, 0.35])
+    np.testing.assert_allclose(spread([0.5, 0.4, 3.0, -2.0], [0.1, 0.3, 0.1, 0.2]), [0.55, 0.35, 0.95, 0.1])
+    np.testing.assert_allclose(spread([0.5, 3.0], [1.0, 2.0]), [-0.5, 1.0])  # no room: as much outside at both ends
     for _ in range(50):
-        wished, sizes = rng.random(6), rng.uniform(0.05, 0.2, 6)
+        wished, sizes = rng.random(6), rng.uniform(0.02, 0.15, 6)
         placed, order = spread(wished, sizes), np.argsort(wished)
         assert (np.diff(placed[order]) > (sizes[order][1:] + sizes[order][:-1]) / 2 - 1e-9).all()
-        assert placed.mean() == pytest.approx(wished.mean())
+        assert (placed - sizes / 2).min() > -1e-9 and (placed + sizes / 2).max() < 1 + 1e-9
+        # No smaller sum of squares by what keeps the order and the room: along each way to such a place it grows
+        for _ in range(20):
+            other = np.sort(rng.random(6))[np.argsort(order)] * (1 - sizes.sum())
+            other[order] += np.cumsum(sizes[order]) - sizes[order] / 2
+            assert (placed - wished) @ (other - placed) > -1e-9
 
 
 def test_lines_differ():

@@ -329,7 +329,7 @@ def plot_scalars(panels: dict[str, list[Curve]], x: XAxis, output: Path, title: 
     with house_style():
         columns = min(len(panels), 3)
         rows = -(-len(panels) // columns)
-        figure = new_figure(3.4 * columns, 2.2 * rows + 0.4)
+        figure = new_figure(3.4 * columns, 2.2 * rows + 0.2)
         grid = figure.subplots(rows, columns, squeeze=False)
         every = [curve for curves in panels.values() for curve in curves]
         names = {curve.label: _name(curve) for curve in every}
@@ -367,6 +367,7 @@ def _legend(figure: Figure, names: dict[str, str], title: str) -> None:
         if columns == 1 or legend.get_window_extent().width < figure.bbox.width:
             break
         legend.remove()
+    figure.set_figheight(figure.get_figheight() + legend.get_window_extent().height / figure.dpi)
     for number, text in enumerate(legend.get_texts()):
         text.set_color(line_style(number)["color"])
 

@@ -101,7 +101,8 @@ def note(figure: Figure, text: str) -> None:
 
 def spread(positions: Sequence[float], sizes: Sequence[float]) -> np.ndarray:
     """
-    Move things along a line apart as little as needed (least squares), keeping their order.
+    Move things between 0 and 1 apart as little as needed (least squares), keeping their order. If there is not room for all,
+    those at both ends stand outside.
 
     :param positions: their middles, shape ``(n,)``
     :param sizes: their extents, shape ``(n,)``
@@ -117,8 +118,10 @@ def spread(positions: Sequence[float], sizes: Sequence[float]) -> np.ndarray:
         while len(clusters) > 1 and np.mean(clusters[-2]) > np.mean(clusters[-1]):
             last = clusters.pop()
             clusters[-1] += last
+    free = 1 - extents.sum()
+    first, last = min(0.0, free / 2), max(free, free / 2)
     result = np.empty_like(offsets)
-    result[order] = offsets + [float(np.mean(cluster)) for cluster in clusters for _ in cluster]
+    result[order] = offsets + np.clip([float(np.mean(cluster)) for cluster in clusters for _ in cluster], first, last)
     return result
 
 
@@ -137,9 +140,9 @@ def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, str]
     size = 8.5
     height = axes.get_window_extent().height * 72 / figure.dpi
     wished = [float(to_axes.transform((0.0, value))[1]) for _, value, _ in ends]
-    names = [text if "\n" in text else textwrap.fill(text, 24) for text, _, _ in ends]
+    names = [text if "\n" in text else textwrap.fill(text, 32) for text, _, _ in ends]
     sizes = [(1 + text.count("\n")) * size * 1.25 / height for text in names]
-    placed = spread([min(max(at, 0.0), 1.0) for at in wished], sizes)
+    placed = spread(wished, sizes)
     for text, (_, _, color), at in zip(names, ends, placed, strict=True):
         axes.annotate(
             text,
