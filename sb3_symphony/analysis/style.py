@@ -116,12 +116,12 @@ def spread(positions: Sequence[float], sizes: Sequence[float]) -> np.ndarray:
     for wish in np.array(positions, dtype=float)[order] - offsets:
         clusters.append([wish])
         while len(clusters) > 1 and np.mean(clusters[-2]) > np.mean(clusters[-1]):
-            last = clusters.pop()
-            clusters[-1] += last
+            *_, before, last = clusters
+            clusters[-2:] = [before + last]
     free = 1 - extents.sum()
-    first, last = min(0.0, free / 2), max(free, free / 2)
+    lowest, highest = min(0.0, free / 2), max(free, free / 2)
     result = np.empty_like(offsets)
-    result[order] = offsets + np.clip([float(np.mean(cluster)) for cluster in clusters for _ in cluster], first, last)
+    result[order] = offsets + np.clip([np.mean(cluster) for cluster in clusters for _ in cluster], lowest, highest)
     return result
 
 

@@ -168,9 +168,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         check_choice("critic_loss", self.critic_loss, (*CRITIC_LOSSES, CLASSIFICATION))
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))
         self._check_classification()
-        # Those that load() got as one of its custom_objects are without what the constructor has added to them
-        added = {"n_critics": self.n_critics, **({"use_sde": True} if self.use_sde else {})}
-        self.policy_kwargs = {**added, **self.policy_kwargs}
+        # Those that load() got as one of its custom_objects are without what the constructor adds
+        self.policy_kwargs = {"n_critics": self.n_critics, **self.policy_kwargs}
         for name in ("n_critics", "use_sde"):
             built = self.policy_kwargs.get(name, False)
             if getattr(self, name) != built:
