@@ -290,10 +290,6 @@ def test_algorithms_of_a_file(write, tmp_path):
             {"figures": {"x": {"evaluations": True}}, "protocol": {"eval_freq": 0}},
             "figures: x: evaluations — expected a protocol with eval_freq > 0",
         ),
-        (
-            {"algorithms": [{"name": "td3", "reported": {"Pendulum-v0": "3"}}], "environments": ["Pendulum-v1"]},
-            "algorithms: td3: reported: unknown name 'Pendulum-v0': did you mean 'Pendulum-v1'?",
-        ),
         ({"figures": {"x": {"mean_per": 10, "evaluations": True}}}, "figures: --mean-per: 10 — is for training episodes"),
         (
             {

@@ -462,8 +462,6 @@ def _check(study: Study, folder: Path) -> None:
             if missing:
                 raise ConfigError(f"{where}: {source.name} has no seed {min(missing)}")
         algorithms[each.name] = each
-        if isinstance(each.reported, dict):
-            _chosen(f"algorithms: {each.name}: reported", each.reported, environments)
     _check_figures(study, algorithms, environments)
 
 
