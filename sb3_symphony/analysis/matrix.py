@@ -93,20 +93,16 @@ def plot_matrix(results: Sequence[Result], names: Sequence[str], label: str, out
         return None
     with house_style():
         figure = new_figure(10.4, max(3.4, 0.42 * len(rows) + 2))
-        _draw(figure, rows, names, label)
+        ends = _draw(figure, rows, names, label)
         note(figure, "mean return of the final models' episodes, deterministic; bars: standard deviation over episodes")
-        last = np.argsort(positions(names), kind="stable")
-        ends = [(name, _end(entries, last), line_style(i)["color"]) for i, (name, entries) in enumerate(rows.items())]
         name_lines(figure, figure.axes[1], ends)
         return save(figure, output)
 
 
-def _end(entries: Sequence[np.ndarray | None], order: np.ndarray) -> float:
-    """Mean of the right-most one that there is."""
-    return float([each.mean() for i in order if (each := entries[i]) is not None][-1])
-
-
-def _draw(figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Sequence[str], label: str) -> None:
+def _draw(
+    figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Sequence[str], label: str
+) -> list[tuple[str, float, str]]:
+    """:return: name, right-most value and colour of each line"""
     heat, lines = figure.subplots(1, 2, width_ratios=(1.25, 1))
     means = np.array([[np.nan if each is None else each.mean() for each in entries] for entries in rows.values()])
     heat.imshow(means, aspect="auto", cmap="cividis")
@@ -122,12 +118,16 @@ def _draw(figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Seque
     heat.grid(visible=False)
 
     at = positions(names)
-    for index, entries in enumerate(rows.values()):
-        known = [i for i in np.argsort(at, kind="stable") if entries[i] is not None]
+    to_the_right = np.argsort(at, kind="stable")
+    ends = []
+    for index, (name, entries) in enumerate(rows.items()):
+        known = [i for i in to_the_right if entries[i] is not None]
         spread = [each.std() for i in known if (each := entries[i]) is not None]
         style = line_style(index)
         lines.errorbar(at[known], means[index, known], spread, **style, marker="o", markersize=3, elinewidth=0.6, capsize=2)
+        ends.append((name, float(means[index, known[-1]]), style["color"]))
     lines.set_xticks(at, names)
     lines.set_xlabel(label)
     lines.set_ylabel("return per episode")
     lines.set_title("the same as lines")
+    return ends

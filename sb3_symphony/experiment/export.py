@@ -3,6 +3,7 @@
 import io
 import warnings
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -97,8 +98,8 @@ def export(options: ExportOptions) -> Export:
     :raises ConfigError: if something is missing or damaged, the agent cannot be exported, or the file not be written
     """
     try:
-        import onnx  # noqa: F401
-        import onnxruntime  # noqa: F401
+        for package in ("onnx", "onnxruntime"):
+            import_module(package)
     except ImportError as error:
         message = f'{error.name} is not installed: pip install "sb3-symphony[export]"'
         raise ConfigError(message) from None

@@ -56,11 +56,11 @@ class WalkerSensors(Camera):
         :return: what the environment returns
         """
         result = super().step(action)
-        walker = self.env.unwrapped
-        upper_and_lower = walker.legs  # type: ignore[attr-defined]  # left upper, left lower, right upper, right lower
+        walker: Any = self.env.unwrapped
+        upper_and_lower = walker.legs  # left upper, left lower, right upper, right lower
         self.contact.append((bool(upper_and_lower[1].ground_contact), bool(upper_and_lower[3].ground_contact)))
-        self.joints.append(tuple(joint.angle for joint in walker.joints))  # type: ignore[attr-defined]
-        self.hull.append(tuple(walker.hull.position))  # type: ignore[attr-defined]
+        self.joints.append(tuple(joint.angle for joint in walker.joints))
+        self.hull.append(tuple(walker.hull.position))
         return result
 
     def close_up(self) -> np.ndarray:
