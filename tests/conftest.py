@@ -71,6 +71,12 @@ def pendulum() -> Callable[..., VecEnv]:
 
 
 @pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process leave no ``training.png``: drawing takes longer than a short training."""
+    monkeypatch.setattr("sb3_symphony.analysis.plots.plot_training", lambda folder: None)
+
+
+@pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 400 kB."""
     disk = tmp_path / "disk"

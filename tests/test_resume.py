@@ -35,6 +35,8 @@ SMALL_ON_POLICY = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 32, "batch_siz
 SMALL_ENSEMBLE = {**SMALL, "gradient_steps": 2, "policy_delay": 3}
 OURS, ON_POLICY = ("symphony", "redq", "droq"), ("ppo", "trpo")
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 
 class Killed(BaseException):
     """What takes the place of ``kill -9`` inside a process: nothing handles it."""
@@ -120,7 +122,7 @@ def contents(folder):
 
 @pytest.mark.parametrize(
     ("algo", "env"),
-    [(algo, "Pendulum-v1") for algo in ALGORITHMS] + [(algo, "BipedalWalker-v3") for algo in (*OURS, "td3", "ppo")],
+    [(algo, "Pendulum-v1") for algo in ALGORITHMS] + [(algo, "BipedalWalker-v3") for algo in ("symphony", "td3", "ppo")],
 )
 def test_killed_in_mid_episode(killed, logged, algo, env, capsys):
     chosen = {"save_freq": 70, "hyperparams": {**small(algo), "env_wrapper": [], "normalize": False}}
@@ -287,7 +289,7 @@ def test_on_policy_iterations_go_on(killed, logged, log_interval):
 
 @pytest.mark.parametrize("algo", ["symphony", "td3", "ppo"])
 def test_results_do_not_depend_on_checkpoints(algo):
-    runs = [train(options(algo, log_folder=str(every), save_freq=every)).run for every in (-1, 1, 70)]
+    runs = [train(options(algo, log_folder=str(every), save_freq=every)).run for every in (-1, 4, 70)]
     plain, often, seldom = (load_algorithm(algo).load(run.model).get_parameters() for run in runs)
     assert difference(plain, often) is None and difference(plain, seldom) is None
     assert_same_results(runs[1].path, runs[2].path)
@@ -807,9 +809,8 @@ def kill_at_random(env, moments, folder, seed):
     return compared
 
 
-@pytest.mark.parametrize("env", KILLED_RUNS)
-def test_kill_9(folder, env):
-    kill_at_random(env, 1, folder, seed=None)
+def test_kill_9(folder):
+    kill_at_random("Pendulum-v1", 1, folder, seed=None)
 
 
 @pytest.mark.slow

@@ -29,6 +29,8 @@ from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.train import build_model, train, train_seeds
 from sb3_symphony.experiment.transfer import find_trained, start_from
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
 OWN_ENV = """
 import gymnasium as gym

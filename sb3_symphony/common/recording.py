@@ -122,14 +122,13 @@ class RecordedEpisode(gym.Wrapper):
             self._set_wrappers(start["wrappers"])
             self._set_generators(start["generators"])
             self.reset(seed=start["seed"], options=start["options"])
-            first = start.get("observation", self.observation)  # files of earlier versions have none
-            if not _same_bits(self.observation, first):
+            if not _same_bits(self.observation, start["observation"]):
                 return False
             for action, reward in zip(state["actions"], rewards, strict=True):
                 _, _, terminated, truncated, _ = self.step(action)
                 if terminated or truncated or self.monitor.rewards[-1] != reward:
                     return False
-            if not _same_bits(self.rewards, state.get("rewards", self.rewards)):  # as wrappers around the monitor see them
+            if not _same_bits(self.rewards, state["rewards"]):  # as wrappers around the monitor see them
                 return False
         finally:
             self.monitor.results_writer = writer
@@ -183,8 +182,6 @@ class RecordedEpisode(gym.Wrapper):
         for (wrapper, own), state in zip(self._own_attributes(), states, strict=True):
             for name, pickled in state.items():
                 value = pickle.loads(pickled)
-                if name not in own and name in vars(wrapper):  # in a file of an earlier version: of the environment inside
-                    continue
                 if _same_form(own.get(name), value):
                     own[name][...] = value  # it may be a view of the simulator's memory
                 else:
