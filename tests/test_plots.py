@@ -141,6 +141,15 @@ def test_names_given_twice(logs, figures):
     assert len(bold) == 1 and len(faint) == 3
 
 
+@pytest.mark.parametrize("n_runs, opacity", [(4, 0.35), (60, 0.1)])
+def test_many_runs_are_drawn_fainter(tmp_path, figures, n_runs, opacity):
+    x, nothing = np.arange(3.0), np.zeros(0)
+    curves = [plots.Curve(label, [(x, x)] * (n_runs // 2), x, x, nothing, nothing) for label in "ab"]
+    plots.plot_curves({"X-v0": curves}, "steps", "reward", "", tmp_path / "curves.png")
+    faint = [line for line in figures[0].axes[0].lines if line.get_linewidth() <= 1]
+    assert [line.get_alpha() for line in faint] == pytest.approx([opacity] * n_runs)
+
+
 def test_training_curves(logs, figures, capsys):
     assert main(["plot", "-a", "sac", "td3", "-e", "X-v0", "-w", "5"]) == 0
     assert capsys.readouterr().out.strip() == "logs/X-v0_episodes.png"

@@ -231,15 +231,17 @@ def scalar_curve(run: Run, tag: str, x: XAxis, max_steps: int | None = None) -> 
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _draw(axes: Axes, curve: Curve, index: int) -> None:
-    style = line_style(index)
-    if len(curve.seeds) > 1:
-        for x, y in curve.seeds:
-            axes.plot(x, y, color=style["color"], linewidth=0.7, alpha=0.35)
-        if len(curve.low):
-            axes.fill_between(curve.x, curve.low, curve.high, color=style["color"], alpha=0.15, linewidth=0)
-    marker = "o" if len(curve.x) <= 40 else None
-    axes.plot(curve.x, curve.y, **style, marker=marker, markersize=3, label=curve.label)
+def _draw(axes: Axes, curves: Sequence[Curve], labels: Sequence[str]) -> None:
+    n_runs = sum(len(curve.seeds) for curve in curves)
+    for curve in curves:
+        style = line_style(labels.index(curve.label))
+        if len(curve.seeds) > 1:
+            for x, y in curve.seeds:  # of many runs none is to hide what is told of all
+                axes.plot(x, y, color=style["color"], linewidth=0.7, alpha=min(0.35, 6 / n_runs))
+            if len(curve.low):
+                axes.fill_between(curve.x, curve.low, curve.high, color=style["color"], alpha=0.15, linewidth=0)
+        marker = "o" if len(curve.x) <= 40 else None
+        axes.plot(curve.x, curve.y, **style, marker=marker, markersize=3, label=curve.label)
 
 
 def _name(curve: Curve) -> str:
@@ -293,8 +295,7 @@ def plot_curves(panels: dict[str, list[Curve]], x: XAxis, y: YAxis, smoothed: st
         grid = figure.subplots(rows, columns, squeeze=False)
         labels = list(dict.fromkeys(curve.label for curves in panels.values() for curve in curves))
         for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
-            for curve in curves:
-                _draw(axes, curve, labels.index(curve.label))
+            _draw(axes, curves, labels)
             axes.set_title(title)
             axes.set_ylabel(_Y_LABELS[y])
             if y == "success":
@@ -335,8 +336,7 @@ def plot_scalars(panels: dict[str, list[Curve]], x: XAxis, output: Path, title: 
         names = {curve.label: _name(curve) for curve in every}
         labels = list(names)
         for axes, (tag, curves) in zip(grid.flat, panels.items(), strict=False):
-            for curve in curves:
-                _draw(axes, curve, labels.index(curve.label))
+            _draw(axes, curves, labels)
             name, unit = SCALARS.get(tag, (tag, ""))
             axes.set_title(name)
             axes.set_ylabel(unit)
