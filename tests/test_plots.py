@@ -168,6 +168,11 @@ def test_training_curves(logs, figures, capsys):
         assert heights.min() == pytest.approx(bottom) and heights.max() == pytest.approx(top)
     assert texts(axes) == ["sac, 3 seeds", "td3"]
     assert [to_hex(text.get_color()).upper() for text in axes.texts] == list(COLORS[:2])
+    drawn = [line for line in axes.lines if line.get_linewidth() > 1]
+    for text, piece, line in zip(axes.texts, figures[0].artists, drawn, strict=True):  # a piece of its line before each name
+        assert (piece.get_color(), piece.get_linestyle()) == (line.get_color(), line.get_linestyle())
+        at, name = piece.get_window_extent(), text.get_window_extent()
+        assert axes.bbox.x1 < at.x0 < at.x1 < name.x0 and abs((at.y0 + at.y1 - name.y0 - name.y1) / 2) < name.height / 4
     assert axes.get_xlabel() == "environment steps" and axes.get_ylabel() == "return per episode"
     assert "running mean of 5 episodes" in figures[0].get_supxlabel().replace("\n", " ")
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -101,8 +102,8 @@ def plot_matrix(results: Sequence[Result], names: Sequence[str], label: str, out
 
 def _draw(
     figure: Figure, rows: dict[str, list[np.ndarray | None]], names: Sequence[str], label: str
-) -> list[tuple[str, float, str]]:
-    """:return: name, right-most value and colour of each line"""
+) -> list[tuple[str, float, dict[str, Any]]]:
+    """:return: name, right-most value and style of each line"""
     heat, lines = figure.subplots(1, 2, width_ratios=(1.25, 1))
     means = np.array([[np.nan if each is None else each.mean() for each in entries] for entries in rows.values()])
     heat.imshow(means, aspect="auto", cmap="cividis")
@@ -125,7 +126,7 @@ def _draw(
         spread = [each.std() for i in known if (each := entries[i]) is not None]
         style = line_style(index)
         lines.errorbar(at[known], means[index, known], spread, **style, marker="o", markersize=3, elinewidth=0.6, capsize=2)
-        ends.append((name, float(means[index, known[-1]]), style["color"]))
+        ends.append((name, float(means[index, known[-1]]), style))
     lines.set_xticks(at, names)
     lines.set_xlabel(label)
     lines.set_ylabel("return per episode")

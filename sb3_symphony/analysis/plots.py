@@ -306,7 +306,7 @@ def plot_curves(panels: dict[str, list[Curve]], x: XAxis, y: YAxis, smoothed: st
             axes.remove()
         note(figure, _explained([curve for curves in panels.values() for curve in curves], smoothed))
         for axes, curves in zip(grid.flat, panels.values(), strict=False):
-            ends = [(_name(c), _end_value(c), line_style(labels.index(c.label))["color"]) for c in curves]
+            ends = [(_name(c), _end_value(c), line_style(labels.index(c.label))) for c in curves]
             name_lines(figure, axes, ends)
         return save(figure, output)
 
@@ -397,10 +397,9 @@ def plot_training(folder: Path, output: Path | None = None, window: int = 20) ->
         ends = []
         if run.episodes is not None and len(run.episodes.steps):
             steps, mean = episode_curve(run, "steps", "reward", window)
-            color = COLORS[0]
-            axes.plot(run.episodes.steps, run.episodes.returns, ".", color=color, alpha=0.3, markersize=4, linewidth=0)
-            axes.plot(steps, mean, color=color)
-            ends.append((f"training,\nmean of {window}", float(mean[-1]), color))
+            axes.plot(run.episodes.steps, run.episodes.returns, ".", color=COLORS[0], alpha=0.3, markersize=4, linewidth=0)
+            axes.plot(steps, mean, **line_style(0))
+            ends.append((f"training,\nmean of {window}", float(mean[-1]), line_style(0)))
         if run.evaluations is not None and len(run.evaluations.steps):
             returns = run.evaluations.returns
             axes.errorbar(
@@ -414,7 +413,7 @@ def plot_training(folder: Path, output: Path | None = None, window: int = 20) ->
                 capsize=2,
                 elinewidth=0.8,
             )
-            ends.append(("evaluation", float(returns[-1].mean()), COLORS[1]))
+            ends.append(("evaluation", float(returns[-1].mean()), {"color": COLORS[1]}))
             note(
                 figure,
                 f"dots: training episodes; evaluation: mean ± standard deviation of {returns.shape[1]} episodes, "

@@ -12,6 +12,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.transforms import Affine2D, ScaledTranslation
 
 from sb3_symphony.common.files import completed
 
@@ -125,13 +127,14 @@ def spread(positions: Sequence[float], sizes: Sequence[float]) -> np.ndarray:
     return result
 
 
-def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, str]]) -> None:
+def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, dict[str, Any]]]) -> None:
     """
-    Write names at the right of a panel, each at the height where its line ends; long ones in several lines.
+    Write names at the right of a panel, behind a piece of each line and at the height where it ends; long ones in several
+    lines.
 
     :param figure: the figure
     :param axes: the panel, everything drawn
-    :param ends: name, last value and colour of each line
+    :param ends: name, last value and style of each line
     """
     if not ends:
         return
@@ -143,14 +146,17 @@ def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, str]
     names = [text if "\n" in text else textwrap.fill(text, 32) for text, _, _ in ends]
     sizes = [(1 + text.count("\n")) * size * 1.25 / height for text in names]
     placed = spread(wished, sizes)
-    for text, (_, _, color), at in zip(names, ends, placed, strict=True):
+    for text, (_, _, style), at in zip(names, ends, placed, strict=True):
+        end = ScaledTranslation(1.0, at, axes.transAxes)  # type: ignore[arg-type]  # affine, which its stubs do not tell
+        points = Affine2D().scale(1 / 72) + figure.dpi_scale_trans + end
+        figure.add_artist(Line2D([5, 25], [0, 0], transform=points, **style))
         axes.annotate(
             text,
             (1.0, at),
-            (5, 0),
+            (30, 0),
             xycoords="axes fraction",
             textcoords="offset points",
-            color=color,
+            color=style["color"],
             fontsize=size,
             va="center",
             annotation_clip=False,
