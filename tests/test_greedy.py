@@ -197,9 +197,10 @@ def test_a_loaded_model_is_not_greedy_by_itself(tmp_path):
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_a_killed_run_goes_on_alike(tmp_path):
+@pytest.mark.parametrize("algo", ["symphony", pytest.param("redq", marks=pytest.mark.slow)])
+def test_a_killed_run_goes_on_alike(algo, tmp_path):
     common = dict(
-        algo="symphony",
+        algo=algo,
         env="Pendulum-v1",
         seed=1,
         eval_freq=0,

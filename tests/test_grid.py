@@ -100,7 +100,7 @@ def contents(*folders):
 
 
 def assert_same_grid(a, b, cells=CELLS):
-    assert done(a) == cells
+    assert done(a) == cells and done(b) == CELLS
     for name in cells:
         assert_same_results(a / name, b / name)
         x, y = (json.loads((results / name / "result.json").read_text()) for results in (a, b))

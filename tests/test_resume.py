@@ -122,7 +122,9 @@ def contents(folder):
 
 @pytest.mark.parametrize(
     ("algo", "env"),
-    [(algo, "Pendulum-v1") for algo in ALGORITHMS] + [(algo, "BipedalWalker-v3") for algo in ("symphony", "td3", "ppo")],
+    [(algo, "Pendulum-v1") for algo in ALGORITHMS]
+    + [(algo, "BipedalWalker-v3") for algo in ("symphony", "td3", "ppo")]
+    + [pytest.param(algo, "BipedalWalker-v3", marks=pytest.mark.slow) for algo in ("redq", "droq")],
 )
 def test_killed_in_mid_episode(killed, logged, algo, env, capsys):
     chosen = {"save_freq": 70, "hyperparams": {**small(algo), "env_wrapper": [], "normalize": False}}
@@ -289,7 +291,7 @@ def test_on_policy_iterations_go_on(killed, logged, log_interval):
 
 @pytest.mark.parametrize("algo", ["symphony", "td3", "ppo"])
 def test_results_do_not_depend_on_checkpoints(algo):
-    runs = [train(options(algo, log_folder=str(every), save_freq=every)).run for every in (-1, 4, 70)]
+    runs = [train(options(algo, log_folder=str(every), save_freq=every)).run for every in (-1, 1, 70)]
     plain, often, seldom = (load_algorithm(algo).load(run.model).get_parameters() for run in runs)
     assert difference(plain, often) is None and difference(plain, seldom) is None
     assert_same_results(runs[1].path, runs[2].path)
@@ -809,8 +811,9 @@ def kill_at_random(env, moments, folder, seed):
     return compared
 
 
-def test_kill_9(folder):
-    kill_at_random("Pendulum-v1", 1, folder, seed=None)
+@pytest.mark.parametrize("env", ["Pendulum-v1", pytest.param("BipedalWalker-v3", marks=pytest.mark.slow)])
+def test_kill_9(folder, env):
+    kill_at_random(env, 1, folder, seed=None)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.transforms import Affine2D, ScaledTranslation
+from matplotlib.transforms import Affine2D, BboxTransformTo, ScaledTranslation
 
 from sb3_symphony.common.files import completed
 
@@ -147,7 +147,7 @@ def name_lines(figure: Figure, axes: Axes, ends: Sequence[tuple[str, float, dict
     sizes = [(1 + text.count("\n")) * size * 1.25 / height for text in names]
     placed = spread(wished, sizes)
     for text, (_, _, style), at in zip(names, ends, placed, strict=True):
-        end = ScaledTranslation(1.0, at, axes.transAxes)  # type: ignore[arg-type]  # affine, which its stubs do not tell
+        end = ScaledTranslation(1.0, at, BboxTransformTo(axes.bbox))  # a fraction of the panel, wherever its layout ends
         points = Affine2D().scale(1 / 72) + figure.dpi_scale_trans + end
         figure.add_artist(Line2D([5, 25], [0, 0], transform=points, **style))
         axes.annotate(

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -234,7 +235,7 @@ def _scalar_panels(options: PlotOptions, groups: "list[Group]") -> "dict[str, li
             lines = _lines(
                 options,
                 [run for run in group.runs if tag in run.scalars],
-                lambda run, tag=tag: scalar_curve(run, tag, options.x_axis, options.max_timesteps),  # type: ignore[misc]
+                partial(scalar_curve, tag=tag, x=options.x_axis, max_steps=options.max_timesteps),
                 left_out,
             )
             if lines:
