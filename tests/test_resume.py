@@ -29,7 +29,8 @@ from sb3_symphony.experiment.environment import EpisodeSeeds
 from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
 from sb3_symphony.experiment.train import train
 
-SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
+# Most runs below are killed after step 200 of 260 and resumed there: fifty updates come before
+SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 150, "buffer_size": 1000, "batch_size": 16}
 SMALL_ON_POLICY = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 32, "batch_size": 32, "n_envs": 1, "use_sde": False}
 # Actor steps fall between environment steps
 SMALL_ENSEMBLE = {**SMALL, "gradient_steps": 2, "policy_delay": 3}
@@ -145,6 +146,7 @@ def test_killed_in_mid_episode(killed, logged, algo, env, capsys):
 
 NO_ZOO_NOISE = {"noise_type": None, "noise_std": None}
 WALKER_STICKY = {"StickyActionNoise": {"sigma": 0.3, "decay_steps": 200, "hold": 3}}
+EPISODES_OF_60 = [{"sb3_symphony.common.wrappers.EpisodeStepLimit": {"max_steps": 60, "until_total_steps": 1000}}]
 VARIANTS = {
     "normalized": ("sac", "Pendulum-v1", {**SMALL, "normalize": True}),
     "normalized on-policy": ("ppo", "Pendulum-v1", {**SMALL_ON_POLICY, "normalize": True, "frame_stack": 3}),
@@ -167,7 +169,11 @@ VARIANTS = {
     ),
     "gSDE": ("sac", "Pendulum-v1", {**SMALL, "use_sde": True, "train_freq": 8, "gradient_steps": 2}),
     "gSDE on-policy": ("ppo", "Pendulum-v1", {**SMALL_ON_POLICY, "use_sde": True, "sde_sample_freq": 4}),
-    "whole episodes": ("td3", "BipedalWalker-v3", {**SMALL, "train_freq": [1, "episode"], "gradient_steps": -1}),
+    "whole episodes": (
+        "td3",
+        "BipedalWalker-v3",
+        {**SMALL, "train_freq": [1, "episode"], "gradient_steps": -1, "env_wrapper": EPISODES_OF_60},
+    ),
     "schedule": ("sac", "Pendulum-v1", {**SMALL, "learning_rate": "lin_1e-3"}),
     "several environments": ("sac", "Pendulum-v1", {**SMALL, "n_envs": 3, "normalize": True}),
     "several walkers": ("ppo", "BipedalWalker-v3", {**SMALL_ON_POLICY, "n_envs": 2}),
@@ -591,7 +597,7 @@ def test_no_room_for_a_saved_model(monkeypatch):
 def test_no_room_at_the_end(monkeypatch, capsys):
     whole = train(options(log_folder="a")).run.path
     argv = "train --algo td3 --env Pendulum-v1 -n 260 --seed 1 --eval-freq 0 --verbose 0 --num-threads 1 --save-freq 100 -f b"
-    small = ["-params", "learning_starts:50", "buffer_size:1000", "batch_size:16", "policy_kwargs.net_arch:[8]"]
+    small = ["-params", "learning_starts:150", "buffer_size:1000", "batch_size:16", "policy_kwargs.net_arch:[8]"]
     with monkeypatch.context() as patched:
         fill_disk_at(patched, "/.Pendulum-v1.zip.")
         assert main([*argv.split(), *small]) == 2
@@ -638,10 +644,10 @@ def interrupt(monkeypatch):
     return at
 
 
-@pytest.mark.parametrize("algo, stops_at", [("symphony", 123), ("sac", 123), ("ppo", 128)])
+@pytest.mark.parametrize("algo, stops_at", [("symphony", 205), ("sac", 205), ("ppo", 224)])
 def test_interrupted_run_goes_on_from_where_it_stopped(interrupt, algo, stops_at):
     whole = train(options(algo, log_folder="a", eval_freq=41)).run.path  # it is interrupted in the step of an evaluation
-    interrupt(123)
+    interrupt(205)
     result = train(options(algo, log_folder="b", eval_freq=41))
     assert result.interrupted and result.steps == stops_at and "interrupted, saved" in result.summary()
     run = result.run
@@ -655,9 +661,9 @@ def test_interrupted_run_goes_on_from_where_it_stopped(interrupt, algo, stops_at
 def test_interrupted_twice(interrupt):
     """The second time the run stops at once, wherever it is: it goes on from the checkpoint before."""
     whole = train(options(log_folder="a")).run.path
-    interrupt(123, times=2)
+    interrupt(223, times=2)
     result = train(options(log_folder="b"))
-    assert result.interrupted and newest_checkpoint(result.run.checkpoints).steps == 100
+    assert result.interrupted and newest_checkpoint(result.run.checkpoints).steps == 200
     resume(result.run.path)
     assert_same_results(whole, result.run.path)
 
