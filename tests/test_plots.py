@@ -129,6 +129,8 @@ def test_names_do_not_overlap():
 
 def test_lines_differ():
     assert len({(style["color"], style["linestyle"]) for style in map(line_style, range(42))}) == 42
+    dark, light = (line_style(COLORS.index(blue))["linestyle"] for blue in ("#0072B2", "#2E8BBF"))
+    assert dark != light
 
 
 # ---------------------------------------------------------------- figures

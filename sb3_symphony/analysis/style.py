@@ -17,8 +17,8 @@ from matplotlib.transforms import Affine2D, BboxTransformTo, ScaledTranslation
 
 from sb3_symphony.common.files import completed
 
-#: Okabe and Ito's colours, the light ones darkened so that text in them is readable on white
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#A8467F", "#000000", "#B27500", "#2E8BBF")
+#: Okabe and Ito's colours, the light ones darkened so that text in them is readable on white; the two blues differ in dashes
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#A8467F", "#2E8BBF", "#B27500", "#000000")
 #: told apart in greyscale too
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)), (0, (8, 2)), (0, (3, 1, 1, 1, 1, 1)))
 GREY = "#555555"
