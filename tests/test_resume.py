@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -757,10 +759,16 @@ def test_environment_that_cannot_be_replayed(killed, capsys):
 def test_signals_to_the_group(folder, number):
     """As `timeout` and Ctrl-C send them: to the run and, unless it has none there, to its environments' processes."""
     arguments = "train --algo sac --env Pendulum-v1 -n 1000000 --vec-env subproc --save-freq 100000 --verbose 0".split()
-    process, _ = start(*arguments, "--no-progress", "-params", "n_envs:2", "learning_starts:1000000", start_new_session=True)
+    params = "n_envs:2", "learning_starts:1000000"
+    heed = partial(signal.signal, number, signal.SIG_DFL)  # nohup lets all that it starts ignore SIGHUP
+    process, _ = start(*arguments, "--no-progress", "-params", *params, start_new_session=True, preexec_fn=heed)
     time.sleep(1)
     os.killpg(process.pid, number)
-    output = process.communicate(timeout=60)[0]
+    try:
+        output = process.communicate(timeout=60)[0]
+    finally:
+        with suppress(ProcessLookupError):  # nobody is left
+            os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 130 and "Traceback" not in output, output
     run = folder / "logs" / "sac" / "Pendulum-v1_1"
     model = load_algorithm("sac").load(run / "Pendulum-v1.zip")
