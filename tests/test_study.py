@@ -247,10 +247,6 @@ def test_algorithms_of_a_file(write, tmp_path):
             {"algorithms": [{"name": "td3", "environments": ["Pendulm-v1"]}]},
             "environments: unknown name 'Pendulm-v1': did you",
         ),
-        (
-            {"algorithms": [{"name": "td3", "reported": {"BipedalWalker": "300"}}]},
-            "algorithms: td3: reported: unknown name 'BipedalWalker': did you mean 'BipedalWalker-v3'?",
-        ),
         ({"algorithms": [{"name": "td3", "seeds": [1, 1]}]}, "td3: seeds: 1 is there 2 times"),
         ({"algorithms": [{"name": "td3", "sweep": "s"}]}, "sweep: unknown name 's' — expected some of those before"),
         ({"algorithms": [{"name": "td3", "sweep": "s", "conf": "x"}]}, "td3: conf and sweep: expected only one of them"),

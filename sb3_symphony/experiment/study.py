@@ -410,7 +410,6 @@ def read_study(path: Path, quick: bool = False, only: Sequence[str] = ()) -> Stu
     try:
         study: Study = validated(Study, values)
         _check(study, path.absolute().parent)
-        _check_reported(study)
         if quick or study.quick is not None:
             shorter = _quick(study)
             try:
@@ -464,14 +463,6 @@ def _check(study: Study, folder: Path) -> None:
                 raise ConfigError(f"{where}: {source.name} has no seed {min(missing)}")
         algorithms[each.name] = each
     _check_figures(study, algorithms, environments)
-
-
-def _check_reported(study: Study) -> None:
-    """Of the whole study: its quick version may have fewer environments than something is reported of."""
-    environments = {each.id: each for each in study.environments}
-    for each in study.algorithms:
-        if isinstance(each.reported, dict):
-            _chosen(f"algorithms: {each.name}: reported", each.reported, environments)
 
 
 def _check_figures(study: Study, algorithms: Mapping[str, Algorithm], environments: Mapping[str, Environment]) -> None:
