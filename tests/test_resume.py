@@ -9,8 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -755,20 +753,18 @@ def test_environment_that_cannot_be_replayed(killed, capsys):
     assert sum(int(row.split(",")[1]) for row in rows[1:]) <= 260
 
 
+@pytest.mark.usefixtures("heeded_hang_up")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_signals_to_the_group(folder, number):
     """As `timeout` and Ctrl-C send them: to the run and, unless it has none there, to its environments' processes."""
     arguments = "train --algo sac --env Pendulum-v1 -n 1000000 --vec-env subproc --save-freq 100000 --verbose 0".split()
-    params = "n_envs:2", "learning_starts:1000000"
-    heed = partial(signal.signal, number, signal.SIG_DFL)  # nohup lets all that it starts ignore SIGHUP
-    process, _ = start(*arguments, "--no-progress", "-params", *params, start_new_session=True, preexec_fn=heed)
+    process, _ = start(*arguments, "--no-progress", "-params", "n_envs:2", "learning_starts:1000000", start_new_session=True)
     time.sleep(1)
     os.killpg(process.pid, number)
     try:
         output = process.communicate(timeout=60)[0]
     finally:
-        with suppress(ProcessLookupError):  # nobody is left
-            os.killpg(process.pid, signal.SIGKILL)
+        process.kill()  # if it has not ended; its environments' processes end with it
     assert process.returncode == 130 and "Traceback" not in output, output
     run = folder / "logs" / "sac" / "Pendulum-v1_1"
     model = load_algorithm("sac").load(run / "Pendulum-v1.zip")

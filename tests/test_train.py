@@ -301,6 +301,7 @@ def test_stopping_during_an_evaluation(monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.usefixtures("heeded_hang_up")
 @pytest.mark.parametrize("save_freq", [0, 50])
 def test_a_closed_terminal_saves_the_model(folder, save_freq):
     """What is written then goes nowhere, and is no error."""
@@ -316,13 +317,16 @@ def test_a_closed_terminal_saves_the_model(folder, save_freq):
     )
     os.close(terminal)
     monitor = folder / "logs/td3/Pendulum-v1_1/0.monitor.csv"
-    deadline = time.monotonic() + 60
-    while not (monitor.exists() and monitor.read_text().count("\n") > 3):
-        assert process.poll() is None and time.monotonic() < deadline
-        if select.select([own], [], [], 0.1)[0]:
-            os.read(own, 4096)
-    os.close(own)
-    assert process.wait(timeout=60) == 130
+    try:
+        deadline = time.monotonic() + 60
+        while not (monitor.exists() and monitor.read_text().count("\n") > 3):
+            assert process.poll() is None and time.monotonic() < deadline
+            if select.select([own], [], [], 0.1)[0]:
+                os.read(own, 4096)
+        os.close(own)
+        assert process.wait(timeout=60) == 130
+    finally:
+        process.kill()  # if it has not ended
     assert TD3.load(monitor.parent / "Pendulum-v1.zip").num_timesteps >= 400
 
 
