@@ -504,6 +504,12 @@ def test_evaluations_that_never_come():
         train(options(eval_freq=0, eval_env_kwargs={"limit": 2.0}, hyperparams=SMALL))
 
 
+def test_checkpoints_that_never_come(folder):
+    with pytest.raises(ConfigError, match="--keep: 5 — needs checkpoints, expected --save-freq > 0"):
+        train(options(keep=5))
+    assert not (folder / "logs").exists()
+
+
 def test_stop_reward(capsys):
     small = {**SMALL, "stop_reward": -1900.0}  # any agent is better
     result = train(options(n_timesteps=5000, hyperparams=small, eval_freq=60, save_freq=50))
