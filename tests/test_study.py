@@ -359,11 +359,12 @@ def test_pages_are_made_from_the_raw_files(path, tmp_path):
     assert page.read_text(encoding="utf-8") == written
 
 
-def test_rows_of_the_ablation_are_made_from_the_raw_files():
+@pytest.mark.parametrize("which, page", [("ablation", "ablation.md"), ("study", "README.md")])
+def test_rows_of_the_walker_are_made_from_the_raw_files(which, page):
     folder = BENCHMARKS / "studies" / "bipedalwalker"
-    table = runpy.run_path(str(folder / "rows.py"))["table"]()
-    page = (folder / "ablation.md").read_text(encoding="utf-8")
-    assert re.findall("<!-- rows -->\n\n(.*?)\n\n<!-- /rows -->", page, re.DOTALL) == [table]
+    table = runpy.run_path(str(folder / "rows.py"))[which]()
+    written = (folder / page).read_text(encoding="utf-8")
+    assert re.findall("<!-- rows -->\n\n(.*?)\n\n<!-- /rows -->", written, re.DOTALL) == [table]
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,17 @@
 """
-Each row of the ablation against all runs of the shipped settings, of whatever study: do three runs tell anything?
+Runs compared by their ranks, as tables in Markdown: do three runs, or ten, tell anything?
 
-    python benchmarks/studies/bipedalwalker/rows.py
+    python benchmarks/studies/bipedalwalker/rows.py ablation    # each row against all runs of the shipped settings
+    python benchmarks/studies/bipedalwalker/rows.py study       # each algorithm against Symphony, seed by seed
 
-A column says how often three of all runs drawn by chance would be as late (or as early) together, by the sum of their ranks:
-exact, one-sided, ties at half ranks. What is not reached within the ablation's steps is the latest there is.
+"By chance" is how often as many of all these runs, drawn at random, would be as late (or as early) together, by the sum of
+their ranks: exact, one-sided, ties at half ranks. What is not reached within the steps compared is the latest there is.
 """
 
+import argparse
 import csv
 import math
+from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
@@ -18,7 +21,7 @@ from sb3_symphony.analysis.runs import read_evaluations
 
 RESULTS = Path(__file__).parents[2] / "results"
 SHIPPED = [("bipedalwalker", "symphony"), ("bipedalwalker_fresh", "symphony"), ("bipedalwalker_ablation", "shipped")]
-STEPS = 40_000
+ABLATION_STEPS, STUDY_STEPS = 40_000, 60_000
 
 
 class Row:
@@ -27,27 +30,42 @@ class Row:
 
     :param study: folder of its results
     :param name: its name there
+    :param steps: environment steps that are looked at
     """
 
-    def __init__(self, study: str, name: str) -> None:
-        with (RESULTS / study / "cells.csv").open(newline="") as file:
-            cells = [cell for cell in csv.DictReader(file) if cell["algorithm"] == name and cell["done"] == "1"]
-        self.solved = [_reached(cell, "stable", "stable_step") for cell in cells]  # S300, in steps
-        self.first = [_reached(cell, "first", "first_episode") for cell in cells]  # E300
+    def __init__(self, study: str, name: str, steps: int) -> None:
+        cells = [cell for cell in _cells(study) if cell["algorithm"] == name]
+        self.seeds = [int(cell["seed"]) for cell in cells]
+        self.solved = [_reached(cell, "stable", "stable_step", steps) for cell in cells]  # S300, in steps
+        self.first = [_reached(cell, "first", "first_episode", steps) for cell in cells]  # E300
         runs = [RESULTS / study / name / f"{cell['environment']}_{cell['seed']}" for cell in cells]
-        self.low, self.every = np.sum([_falls(run) for run in runs], axis=0) if runs else (0, 0)
+        self.low, self.every = np.sum([_falls(run, steps) for run in runs], axis=0) if runs else (0, 0)
+
+    @property
+    def falls(self) -> str:
+        return f"{self.low} of {self.every}, {self.low / self.every:.0%}"
 
 
-def _reached(cell: dict[str, str], what: str, value: str) -> float:
-    there = cell[f"{what}_reached"] == "1" and float(cell[f"{what}_step"]) <= STEPS
+def _cells(study: str) -> Iterator[dict[str, str]]:
+    """Those that are done."""
+    with (RESULTS / study / "cells.csv").open(newline="") as file:
+        yield from (cell for cell in csv.DictReader(file) if cell["done"] == "1")
+
+
+def _names(study: str) -> list[str]:
+    return list(dict.fromkeys(cell["algorithm"] for cell in _cells(study)))
+
+
+def _reached(cell: dict[str, str], what: str, value: str, steps: int) -> float:
+    there = cell[f"{what}_reached"] == "1" and float(cell[f"{what}_step"]) <= steps
     return float(cell[value]) if there else math.inf
 
 
-def _falls(run: Path) -> tuple[int, int]:
+def _falls(run: Path, steps: int) -> tuple[int, int]:
     """Evaluation episodes below 200 from the first evaluation of 200 on, and all of them."""
     evaluations = read_evaluations(run)
     assert evaluations is not None  # the run is done
-    returns = evaluations.returns[evaluations.steps <= STEPS]
+    returns = evaluations.returns[evaluations.steps <= steps]
     walking = returns[np.cumsum(returns.mean(axis=1) >= 200) > 0]
     return int((walking < 200).sum()), walking.size
 
@@ -66,14 +84,19 @@ def chance(runs: list[float], others: list[float]) -> str:
     return f"{'late' if late < early else 'early'}, {min(late, early):.0%}"
 
 
+def _told(values: list[float], scale: float) -> list[str]:
+    """What is not reached is a dash."""
+    return ["–" if math.isinf(value) else f"{value / scale:g}" for value in values]
+
+
 def told(values: list[float], scale: float = 1) -> str:
-    """In ascending order; what is not reached is a dash."""
-    return ", ".join("–" if math.isinf(value) else f"{value / scale:g}" for value in sorted(values))
+    """In ascending order."""
+    return ", ".join(_told(sorted(values), scale))
 
 
-def table() -> str:
+def ablation() -> str:
     """:return: a table in Markdown"""
-    shipped = [Row(study, name) for study, name in SHIPPED]
+    shipped = [Row(study, name, ABLATION_STEPS) for study, name in SHIPPED]
     solved, first = ([value for row in shipped for value in getattr(row, name)] for name in ("solved", "first"))
     low, every = sum(row.low for row in shipped), sum(row.every for row in shipped)
     lines = [
@@ -81,16 +104,30 @@ def table() -> str:
         "|---|---|---|---|---|---|",
         f"| shipped, {len(solved)} runs | {told(solved, 1000)} | | {told(first)} | | {low} of {every}, {low / every:.0%} |",
     ]
-    with (RESULTS / "bipedalwalker_ablation" / "cells.csv").open(newline="") as file:
-        names = dict.fromkeys(cell["algorithm"] for cell in csv.DictReader(file))
-    for name in names:
-        row = Row("bipedalwalker_ablation", name)
+    for name in _names("bipedalwalker_ablation"):
+        row = Row("bipedalwalker_ablation", name, ABLATION_STEPS)
         if name != "shipped" and len(row.solved) == 3:
             both = chance(row.solved, solved), chance(row.first, first)
-            falls = f"{row.low} of {row.every}, {row.low / row.every:.0%}"
-            lines.append(f"| {name} | {told(row.solved, 1000)} | {both[0]} | {told(row.first)} | {both[1]} | {falls} |")
+            lines.append(f"| {name} | {told(row.solved, 1000)} | {both[0]} | {told(row.first)} | {both[1]} | {row.falls} |")
     return "\n".join(lines)
 
 
+def study() -> str:
+    """:return: two tables in Markdown"""
+    rows = {name: Row("bipedalwalker", name, STUDY_STEPS) for name in _names("bipedalwalker") if name != "droq-greedy"}
+    ours = rows["symphony"]
+    tables = []
+    for title, what, scale in (("S300, thousands", "solved", 1000), ("first return of 300 in episode", "first", 1)):
+        lines = [f"| {title}, seed | {' | '.join(map(str, ours.seeds))} | by chance |", "|---" * (len(ours.seeds) + 2) + "|"]
+        for name, row in rows.items():
+            values = dict(zip(row.seeds, _told(getattr(row, what), scale), strict=True))
+            against = chance(getattr(row, what), getattr(ours, what)) if row is not ours else ""
+            lines.append(f"| {name} | {' | '.join(values.get(seed, '') for seed in ours.seeds)} | {against} |")
+        tables.append("\n".join(lines))
+    return "\n\n".join(tables)
+
+
 if __name__ == "__main__":
-    print(table())
+    parser = argparse.ArgumentParser(description="Compare runs by their ranks.")
+    parser.add_argument("which", choices=("ablation", "study"))
+    print({"ablation": ablation, "study": study}[parser.parse_args().which]())
