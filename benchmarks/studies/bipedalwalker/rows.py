@@ -81,7 +81,8 @@ def chance(runs: list[float], others: list[float]) -> str:
     own = sum(ranks[: len(runs)])
     sums = np.array([sum(drawn) for drawn in combinations(ranks, len(runs))])
     late, early = (sums >= own).mean(), (sums <= own).mean()
-    return f"{'late' if late < early else 'early'}, {min(late, early):.0%}"
+    share = min(late, early)
+    return f"{'late' if late < early else 'early'}, {f'{share:.0%}' if share >= 0.005 else '< 1%'}"
 
 
 def _told(values: list[float], scale: float) -> list[str]:
