@@ -373,6 +373,7 @@ def test_rows_of_the_walker_are_made_from_the_raw_files(which, page):
         ([4, 5], [1, 2, 3], "late, 10%"),  # 1 of 10 draws
         ([1, 3], [2, 4, 5], "early, 20%"),
         ([math.inf], [1, math.inf, 2], "late, 50%"),  # the last two share a rank
+        ([8, 9, 10, 11, 12], [1, 2, 3, 4, 5, 6, 7], "late, < 1%"),  # 1 of 792
     ],
 )
 def test_chance_of_ranks(runs, others, expected):
