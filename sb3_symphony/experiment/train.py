@@ -285,7 +285,7 @@ def prepare(
         raise ConfigError(f"stop_reward: {config.settings.stop_reward:g} — needs evaluations, expected --eval-freq > 0")
     if options.eval_env_kwargs and options.eval_freq <= 0:
         raise ConfigError(f"--eval-env-kwargs: {options.eval_env_kwargs} — needs evaluations, expected --eval-freq > 0")
-    if fresh and "keep" in options.model_fields_set and options.save_freq <= 0:
+    if "keep" in options.model_fields_set and options.save_freq <= 0:
         raise ConfigError(f"--keep: {options.keep} — needs checkpoints, expected --save-freq > 0")
     evaluation_env = None
     if options.eval_freq > 0:
