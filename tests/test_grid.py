@@ -57,9 +57,11 @@ class CrashEnv(gym.Env):
     def step(self, action):
         if self.spec.id == "Raise-v0":
             raise RuntimeError("the motor is hot\\nsecond line")
+        if self.spec.id == "Quit-v0":
+            os._exit(3)
         os.kill(os.getpid(), signal.SIGKILL)
 
-for name in ("Raise-v0", "Die-v0"):
+for name in ("Raise-v0", "Die-v0", "Quit-v0"):
     if name not in gym.registry:
         gym.register(name, entry_point=CrashEnv)
 """
@@ -323,12 +325,13 @@ def test_a_failed_cell_stops_nothing(folder, monkeypatch, capsys):
     (folder / "crash.py").write_text(CRASH)
     monkeypatch.setenv("PYTHONPATH", str(folder))
     monkeypatch.syspath_prepend(folder)
-    environments = [{"id": "crash:Raise-v0"}, {"id": "crash:Die-v0"}, "Pendulum-v1"]
+    environments = [{"id": f"crash:{name}-v0"} for name in ("Raise", "Die", "Quit")] + ["Pendulum-v1"]
     study = write_study(folder, environments=environments, algorithms=STUDY["algorithms"][:1], seeds=1, steps=210)
     assert main(["bench", str(study), "-j", "1", "-f", "results"]) == 1
     out, err = capsys.readouterr()
     assert "failed: td3/Raise-v0_0: RuntimeError: the motor is hot (see" in err
     assert "failed: td3/Die-v0_0: its process was ended by SIGKILL (out of memory?)" in err
+    assert "failed: td3/Quit-v0_0: its process ended with code 3 (see" in err
     assert "- not done, and not in these numbers: td3 0" in out
     assert done(folder / "results") == ["td3/Pendulum-v1_0"]
     assert "Traceback" in (folder / "results" / "td3" / "Raise-v0_0.log").read_text()

@@ -1,12 +1,15 @@
 """The cells of a grid as they are shown while they run, in a terminal and elsewhere."""
 
 import io
+import threading
 
 import pytest
 import yaml
 from rich.console import Console
 
 from sb3_symphony.experiment import grid_view
+from sb3_symphony.experiment.cell import Outcome
+from sb3_symphony.experiment.grid import _Session
 from sb3_symphony.experiment.grid_progress import Progress
 from sb3_symphony.experiment.grid_view import View, plain_table
 from sb3_symphony.experiment.run_folder import RunFolder
@@ -23,6 +26,29 @@ def cells(tmp_path):
     progress[0].state, progress[0].kept, progress[0].steps = "done", True, 1000
     progress[1].steps, progress[1].latest = 100, -1234.56
     return progress
+
+
+def test_what_ends_while_the_view_is_drawn_is_taken_up(cells, tmp_path, monkeypatch):
+    """The worker's last word may come between a look at the cells and the end of its thread."""
+    drawing, said = threading.Event(), threading.Event()
+    worker = []
+
+    class SlowView(View):
+        def update(self, stopping):
+            drawing.set()
+            assert said.wait(60)
+            worker[0].join()
+
+    class Backend:
+        def map(self, function, jobs):
+            worker.append(threading.current_thread())
+            assert drawing.wait(60)
+            yield jobs[0], Outcome("done")
+            said.set()
+
+    monkeypatch.setattr(grid_view, "View", SlowView)
+    assert not _Session(cells, cells[1:2], tmp_path, tmp_path, Backend(), tensorboard=False).run()
+    assert cells[1].state == "done"
 
 
 @pytest.fixture

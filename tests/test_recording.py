@@ -1,5 +1,6 @@
 """Episodes that are recorded, and made again from their actions."""
 
+import ctypes
 import pickle
 import types
 
@@ -175,3 +176,28 @@ def test_an_episode_that_ends_in_its_replay_is_noticed(tmp_path):
     env.unwrapped.where = "end"
     assert not env.replay(state)
     assert (tmp_path / "0.monitor.csv").read_text() == before  # it never happened
+
+
+class SkipFrames(gym.Wrapper):
+    """Two steps for each action; its driver cannot be pickled."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.driver = ctypes.pointer(ctypes.c_int(1))
+
+    def step(self, action):
+        _, first, *_ = self.env.step(action)
+        observation, second, *others = self.env.step(action)
+        return observation, first + second, *others
+
+
+def test_several_steps_of_the_monitor_for_each_action():
+    env, other = (recorded("Pendulum-v1", SkipFrames) for _ in range(2))
+    env.reset(seed=1)
+    other.reset(seed=2)
+    for action in np.linspace(-1, 1, 20, dtype=np.float32):
+        env.step(np.array([action]))
+    state = env.recorded_state()
+    assert other.replay(state) and len(other.monitor.rewards) == 40
+    state["monitor"]["rewards"][3] += 1e-9
+    assert not other.replay(state) and len(other.actions) == 2

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from PIL import Image
-from stable_baselines3 import TD3
+from stable_baselines3 import SAC, TD3
 
 from sb3_symphony.cli import main
 from sb3_symphony.experiment.config import run_settings
@@ -318,3 +318,17 @@ def test_mp4_without_its_library(model, capsys, monkeypatch):
     assert main([*argv, "a.mp4"]) == 2
     assert 'pip install "sb3-symphony[video]"' in capsys.readouterr().err
     assert main([*argv, "a.gif"]) == 0
+
+
+def test_agents_of_a_film_draw_no_random_numbers_from_each_other(tmp_path, monkeypatch):
+    """Each episode is the one that its agent plays alone on that seed."""
+    monkeypatch.chdir(tmp_path)
+    for seed in (0, 1):
+        SAC("MlpPolicy", "Counter-v0", buffer_size=10, policy_kwargs={"net_arch": [4]}, seed=seed).save(f"agent{seed}")
+    moves = []
+    step = Counter.step
+    monkeypatch.setattr(Counter, "step", lambda self, action: moves.append(action.item()) or step(self, action))
+    for agents in ("agent0", "agent1", "agent0 agent1 --grid"):
+        argv = f"video {agents} --algo sac --env Counter-v0 --stochastic -o a.gif --no-progress --width 100"
+        assert main(argv.split()) == 0
+    assert len(moves) == 80 and moves[:40] == moves[40::2] + moves[41::2]

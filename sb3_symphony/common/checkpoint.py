@@ -13,7 +13,6 @@ A checkpoint holds pickled objects: resume only runs of people you trust.
 
 import inspect
 import os
-import random
 import re
 import time
 from collections import Counter, deque
@@ -32,8 +31,9 @@ from stable_baselines3.common.distributions import StateDependentNoiseDistributi
 from stable_baselines3.common.save_util import recursive_getattr
 
 from sb3_symphony.common.buffers import end_trajectory
-from sb3_symphony.common.checks import check_number
+from sb3_symphony.common.checks import check_number, last_line
 from sb3_symphony.common.files import DamagedFile, checked_content, seal, unseal
+from sb3_symphony.common.generators import generator_states, restore_generators
 from sb3_symphony.common.recording import each_copy, is_recorded, restore_vec_env, vec_env_state
 from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, restore_buffer
 from sb3_symphony.common.versions import package_versions, processor
@@ -71,21 +71,11 @@ def _gsde_distributions(model: BaseAlgorithm) -> list[StateDependentNoiseDistrib
 
 
 def _generators(model: BaseAlgorithm) -> dict[str, Any]:
-    return {
-        "python": random.getstate(),
-        "numpy": np.random.get_state(),
-        "torch": th.get_rng_state(),
-        "cuda": th.cuda.get_rng_state_all() if th.cuda.is_initialized() else [],
-        "action space": model.action_space.np_random.bit_generator.state,
-    }
+    return {**generator_states(), "action space": model.action_space.np_random.bit_generator.state}
 
 
 def _restore_generators(model: BaseAlgorithm, states: dict[str, Any]) -> None:
-    random.setstate(states["python"])
-    np.random.set_state(states["numpy"])
-    th.set_rng_state(states["torch"])
-    if states["cuda"] and th.cuda.is_available():
-        th.cuda.set_rng_state_all(states["cuda"][: th.cuda.device_count()])  # there may have been more
+    restore_generators(states)
     model.action_space.np_random.bit_generator.state = states["action space"]
 
 
@@ -362,8 +352,7 @@ class ExactCheckpoints(BaseCallback):
                 restore_buffer(self._buffer, state["buffer"], self.segments)
             restore_training_state(model, state)
         except (RuntimeError, ValueError, TypeError, AttributeError, LookupError) as error:  # PyTorch's, NumPy's
-            what = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
-            raise DoesNotFit(f"the checkpoint at {checkpoint.steps} steps is of another model — {what}") from error
+            raise DoesNotFit(f"the checkpoint at {checkpoint.steps} steps is of another model — {last_line(error)}") from error
         for key, callback in self._named_callbacks():
             vars(callback).update(state["callbacks"].get(key, {}))
 

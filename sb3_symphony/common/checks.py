@@ -94,6 +94,14 @@ def suggestion(value: Any, options: Iterable[Any]) -> str:
     return f": did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
 
 
+def last_line(error: Exception) -> str:
+    """
+    :param error: what went wrong in somebody else's code
+    :return: the last line of its message, where libraries say what it was; its kind if it has none
+    """
+    return (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
+
+
 def constructor_parameters(class_: type, eval_str: bool = False) -> dict[str, inspect.Parameter]:
     """
     :param class_: any class

@@ -1,7 +1,6 @@
 """Bias of the critics: how far they are from the returns that the policy really gets."""
 
 import copy
-import random
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -12,11 +11,12 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.utils import check_for_correct_spaces, set_random_seed
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, unwrap_vec_normalize
 
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.ensembles import EnsembleCritic
+from sb3_symphony.common.generators import generator_states, restore_generators
 
 
 class QBias(NamedTuple):
@@ -60,25 +60,21 @@ def monte_carlo_returns(rewards: np.ndarray, bonuses: np.ndarray, gamma: float, 
 def _without_a_trace(model: OffPolicyAlgorithm, seed: int) -> Iterator[None]:
     """Inside the block global generators are seeded and networks in evaluation mode; after it all is as before."""
     policy: Any = model.policy
-    numpy_state, python_state = np.random.get_state(), random.getstate()
+    generators = generator_states()
     modes = {module: module.training for module in policy.modules()}
     distribution = getattr(policy.actor, "action_dist", None)
     if distribution is not None:
         policy.actor.action_dist = copy.copy(distribution)  # it keeps what was drawn last, for gSDE the noise matrix
-    with th.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
-        th.manual_seed(seed)
-        np.random.seed(seed)
-        random.seed(seed)
-        policy.set_training_mode(False)
-        try:
-            yield
-        finally:
-            for module, mode in modes.items():
-                module.training = mode
-            if distribution is not None:
-                policy.actor.action_dist = distribution
-            np.random.set_state(numpy_state)
-            random.setstate(python_state)
+    set_random_seed(seed)
+    policy.set_training_mode(False)
+    try:
+        yield
+    finally:
+        for module, mode in modes.items():
+            module.training = mode
+        if distribution is not None:
+            policy.actor.action_dist = distribution
+        restore_generators(generators)
 
 
 def _mean_q(critic: Any, observations: Any, actions: th.Tensor) -> th.Tensor:
@@ -202,7 +198,7 @@ def q_bias(
                 done = bool(dones[0])
             last_value = 0.0
             if infos[0].get("TimeLimit.truncated", False):
-                last = _act(model, _batch_of_one(infos[0]["terminal_observation"]), ent_coef)
+                last = _act(model, infos[0]["terminal_observation"], ent_coef)
                 last_value = last.q_value + last.bonus
             bonuses = np.array([step.bonus for step in steps])
             episode_returns = monte_carlo_returns(np.array(rewards), bonuses, model.gamma, last_value)
@@ -212,12 +208,6 @@ def q_bias(
     mean, std, mean_return = float(bias.mean()), float(bias.std()), float(np.mean(returns))
     scale = abs(mean_return) or float("nan")
     return QBias(mean / scale, std / scale, mean, std, mean_return, len(bias))
-
-
-def _batch_of_one(observation: Any) -> Any:
-    if isinstance(observation, dict):
-        return {key: np.asarray(value)[None] for key, value in observation.items()}
-    return np.asarray(observation)[None]  # that of a Discrete space may be a number
 
 
 class QBiasCallback(BaseCallback):

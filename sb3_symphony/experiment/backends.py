@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from sb3_symphony.common.checks import last_line
 from sb3_symphony.common.versions import package_versions
 from sb3_symphony.experiment.config import ConfigError
 
@@ -105,12 +106,12 @@ class Loky:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-def _seen(token: str) -> tuple[str, str | None, dict[str, str]]:
-    """What a machine sees: its name, the content of a file, and versions of packages."""
+def _seen(token: str) -> tuple[str | None, dict[str, str]]:
+    """What a machine sees: the content of a file, and versions of packages."""
     content = None
     with suppress(OSError):
         content = Path(token).read_text(encoding="utf-8")
-    return socket.gethostname(), content, package_versions()
+    return content, package_versions()
 
 
 #: how HTTP/2, which Ray's servers speak, begins, with settings that change nothing (RFC 9113, 3.4)
@@ -198,10 +199,9 @@ class Ray:
             look = self.ray.remote(num_cpus=0, scheduling_strategy=where)(_seen)
             name = f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
             try:
-                _, seen, versions = self.ray.get(look.remote(str(token)), timeout=_TIMEOUT)
+                seen, versions = self.ray.get(look.remote(str(token)), timeout=_TIMEOUT)
             except self.ray.exceptions.RayError as error:
-                reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-                raise ConfigError(f"machine {name} cannot run cells — {reason}") from None
+                raise ConfigError(f"machine {name} cannot run cells — {last_line(error)}") from None
             if seen != content:
                 raise ConfigError(f"machine {name} does not see '{folder}' — expected a folder that all machines share (-f)")
             differing = [f"{k} {v}, here {package_versions()[k]}" for k, v in versions.items() if v != package_versions()[k]]

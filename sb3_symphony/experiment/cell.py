@@ -163,16 +163,16 @@ def _execute(job: Job) -> int:
 
 
 def _reason(code: int, log: Path) -> str:
-    if code < 0:
+    if code != _FAILED:
         return ended_by(code)
-    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    return lines[-1] if lines else f"its process ended with code {code}"
+    return log.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()[-1]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The cell's own process
 # ----------------------------------------------------------------------------------------------------------------------
 
+_FAILED = 70  # with the reason in the last line of the log; not 1, with which anything else may end the process
 _STOPPED = 130
 
 
@@ -359,7 +359,7 @@ def main() -> int:
         sys.stderr.flush()
         first_line = next(iter(str(error).splitlines()), "")
         print(f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__)
-    return 1
+    return _FAILED
 
 
 if __name__ == "__main__":

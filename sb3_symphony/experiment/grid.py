@@ -26,6 +26,7 @@ from uuid import uuid4
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from sb3_symphony.common.checks import last_line
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.cell import Control, Job, Outcome, supervise
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
@@ -396,8 +397,10 @@ class _Session:
             thread = threading.Thread(target=self._work, daemon=True)
             thread.start()
             said, beat = 0, time.monotonic()
-            while thread.is_alive():
+            running = True
+            while running:
                 thread.join(timeout=1.0)
+                running = thread.is_alive()  # asked before the look: what it says last is taken up, too
                 with suppress(OSError):  # a full disk: said again. Cells that hear nothing for long save and stop
                     if self.stop != said or time.monotonic() - beat >= _BEAT:
                         self.control.say(self.stop)
@@ -435,8 +438,7 @@ class _Session:
         while not self.ended.empty():
             job, outcome = self.ended.get()
             if isinstance(outcome, Exception):
-                told = str(outcome).strip().splitlines() or [type(outcome).__name__]
-                outcome = Outcome("failed", f"its worker died — {told[-1]}")
+                outcome = Outcome("failed", f"its worker died — {last_line(outcome)}")
             elif outcome.state == "stopped" and not self.stop:
                 outcome = Outcome("failed", "was stopped by a signal from elsewhere")
             each = self.left[job.name]

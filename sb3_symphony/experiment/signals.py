@@ -48,9 +48,11 @@ def end_with_parent() -> None:
 
 def ended_by(code: int) -> str:
     """
-    :param code: exit code of a process that a signal has ended
+    :param code: exit code of a process, negative if a signal has ended it
     :return: what it ended by, in words
     """
+    if code >= 0:
+        return f"its process ended with code {code}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"  # real-time ones have no name
     return f"its process was ended by {name}" + " (out of memory?)" * (name == "SIGKILL")
 

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from sb3_symphony.common.averaging import AveragedActor
 from sb3_symphony.common.checkpoint import newest_checkpoint
+from sb3_symphony.common.checks import last_line
 from sb3_symphony.common.files import DamagedFile
 from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
 from sb3_symphony.experiment.agent import check_match, load_model, load_normalization
@@ -125,10 +126,9 @@ def _take_networks(model: BaseAlgorithm, trained: BaseAlgorithm, origin: str) ->
             else:
                 target.load_state_dict(given[name], strict=True)
     except (RuntimeError, ValueError, KeyError) as error:
-        what = str(error).strip().splitlines()[-1].strip()
         raise ConfigError(
             f"-i: networks of {origin} (policy_kwargs {trained.policy_kwargs}) do not fit the configuration's "
-            f"({model.policy_kwargs}) — {what}"
+            f"({model.policy_kwargs}) — {last_line(error)}"
         ) from None
     if isinstance(model.policy, AveragedActor):
         model.policy.restart_average()  # its count of updates came along

@@ -213,7 +213,9 @@ class TrialProcesses:
             result = self._results[index].recv()
         except (EOFError, OSError):
             self._processes[index].join()
-            raise TrialFailed(f"seed {self.seeds[index]}: {_ending(self._processes[index].exitcode)}", "died") from None
+            code = self._processes[index].exitcode
+            assert code is not None
+            raise TrialFailed(f"seed {self.seeds[index]}: {ended_by(code)}", "died") from None
         if isinstance(result, _Failure):
             raise TrialFailed(f"seed {self.seeds[index]}: {result.reason}", result.kind)
         return result
@@ -232,9 +234,3 @@ class TrialProcesses:
             process.join()
         for results in self._results:
             results.close()
-
-
-def _ending(exitcode: int | None) -> str:
-    if exitcode is not None and exitcode < 0:
-        return ended_by(exitcode)
-    return f"its process ended with code {exitcode}"

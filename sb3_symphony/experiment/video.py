@@ -26,6 +26,7 @@ from stable_baselines3.common.env_util import unwrap_wrapper
 
 from sb3_symphony.analysis.runs import named_apart
 from sb3_symphony.common.files import completed
+from sb3_symphony.common.generators import generator_states, restore_generators
 from sb3_symphony.experiment.agent import Agent, open_agent
 from sb3_symphony.experiment.config import ConfigError, told
 from sb3_symphony.experiment.output import check_folder, output_file, progress_bar
@@ -34,7 +35,7 @@ from sb3_symphony.experiment.select import AgentsOptions, Selection, SelectOptio
 
 SUFFIXES = (".mp4", ".gif")
 _HOLD = 1.0  # seconds that the last picture stays
-_GIF_FPS = 50  # the most that the format's clock can do, in hundredths of a second, and players keep up with
+_GIF_FPS = 50  # delays are in hundredths of a second, and players take one of a single hundredth for ten
 _GAP = 4  # pixels between the agents of a grid
 
 
@@ -262,10 +263,23 @@ def sampled(moments: Iterable[_Moment], steps_per_second: float, fps: float) -> 
         yield before
 
 
+def _undisturbed(moments: Iterator[_Moment]) -> Iterator[_Moment]:
+    """An episode from which the others of a film, played in turn, take no random numbers."""
+    generators = generator_states()
+    while True:
+        restore_generators(generators)
+        moment = next(moments, None)
+        generators = generator_states()
+        if moment is None:
+            return
+        yield moment
+
+
 def _pictures(agents: Sequence[Shown], options: VideoOptions, fps: float, width: int | None) -> Iterator[np.ndarray]:
     """The film. Agents play the same seeds; who has finished waits for the others."""
     for seed in range(options.seed, options.seed + options.n_episodes):
-        films = [sampled(_episode(shown, seed, options), shown.steps_per_second, fps) for shown in agents]
+        episodes = [_undisturbed(_episode(shown, seed, options)) for shown in agents]
+        films = [sampled(each, shown.steps_per_second, fps) for each, shown in zip(episodes, agents, strict=True)]
         drawn: list[np.ndarray] = [np.empty(0)] * len(agents)
         while True:
             running = False
@@ -406,7 +420,7 @@ def _check_ffmpeg(output: Path) -> None:
 
 
 def _film(agents: Sequence[Shown], options: VideoOptions, output: Path) -> Path:
-    highest = 25.0 if output.suffix.lower() == ".gif" else 50.0  # what players of GIFs keep up with; what looks smooth
+    highest = 25.0 if output.suffix.lower() == ".gif" else 50.0  # a GIF is large; what looks smooth
     fps = float(options.fps or min(highest, max(shown.steps_per_second for shown in agents)))
     width = options.width or (None if len(agents) == 1 else 400)
     seconds = [(shown.most_steps(options.n_timesteps) or math.inf) / shown.steps_per_second for shown in agents]
