@@ -634,7 +634,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Run the command line.
 
     :param argv: arguments, those of the process if not given
-    :return: exit status: 0, 2 for a mistake in the input, 130 after an interruption
+    :return: exit status: 0, 1 if cells of a grid failed, 2 for a mistake in the input, 130 after an interruption, 141 if
+        nobody reads the output any more
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     for name in ("stdout", "stderr"):

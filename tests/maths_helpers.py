@@ -22,6 +22,14 @@ def make_critic(net_arch=(16, 16), dtype=th.float64, obs_dim=OBS_DIM, action_dim
     return EnsembleCritic(space, box(action_dim), list(net_arch), FlattenExtractor(space), obs_dim, **kwargs).to(dtype)
 
 
+def fade_weights(size, fade_factor=7.0, fade_power=2.0):
+    """Probability of every stored transition under fading replay, oldest first."""
+    if fade_factor is None or np.isinf(fade_factor):
+        return np.full(size, 1.0 / size)
+    weights = np.tanh(fade_factor * (np.arange(size) / size) ** fade_power)
+    return weights / weights.sum() if weights.any() else np.full(size, 1.0 / size)
+
+
 def separate_networks(stacked):
     """N ordinary networks with copies of the weights of a ``StackedMLP``."""
     n_members = len(stacked.layers[-1].weight)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
 from sb3_symphony.analysis.runs import NotRecorded, Run, open_run
 from sb3_symphony.analysis.statistics import bootstrap_interval, iqm
@@ -115,14 +115,14 @@ def block_mean(values: np.ndarray, size: int) -> np.ndarray:
     return values[: len(values) // size * size].reshape(-1, size).mean(axis=1)
 
 
-def _common_grid(xs: Sequence[np.ndarray], n_points: int = 300) -> np.ndarray:
+def _common_grid(xs: Sequence[np.ndarray]) -> np.ndarray:
     """Where all seeds are known: the points of the shortest one if the others share them, else even steps."""
     shortest = min(xs, key=len)
     if all(np.array_equal(x[: len(shortest)], shortest) for x in xs):
         return shortest
     if min(map(len, xs)) == 0 or max(x[0] for x in xs) > min(x[-1] for x in xs):
         return np.empty(0)
-    return np.linspace(max(x[0] for x in xs), min(x[-1] for x in xs), n_points)
+    return np.linspace(max(x[0] for x in xs), min(x[-1] for x in xs), 300)
 
 
 def summarised(label: str, seeds: Sequence[Line]) -> Curve:
@@ -256,17 +256,13 @@ def _scale_x(axes: Axes, x: XAxis, right: float | None = None) -> None:
     if x == "time":
         right = axes.get_xlim()[1]
         unit, size = next((u, s) for u, s in (("hours", 3600), ("minutes", 60), ("seconds", 1)) if right >= 2 * s or s == 1)
-        step = next(s for s in _nice_steps() if right / (s * size) <= 8)
-        ticks = np.arange(0, right / size + 1e-9, step)
+        ticks = np.asarray(MaxNLocator(8, steps=[1, 2, 5, 10]).tick_values(0, right / size))
+        ticks = ticks[ticks <= right / size + 1e-9]
         axes.set_xticks(ticks * size, [f"{tick:g}" for tick in ticks])
         axes.set_xlabel(f"wall-clock time ({unit})")
     else:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_xlabel(_X_LABELS[x])
-
-
-def _nice_steps() -> list[float]:
-    return [factor * 10.0**power for power in range(-3, 7) for factor in (1, 2, 5)]
 
 
 def _explained(curves: Sequence[Curve], smoothed: str) -> str:
@@ -380,13 +376,12 @@ def _title(run: Run) -> str:
     return f"{run.algo} on {run.env}" + ("" if run.seed is None else f", seed {run.seed}")
 
 
-def plot_training(folder: Path, output: Path | None = None, window: int = 20) -> Path:
+def plot_training(folder: Path, output: Path | None = None) -> Path:
     """
     Draw one run: returns of its training episodes and evaluations against environment steps.
 
     :param folder: run folder
     :param output: image file, ``training.png`` in the run folder if not given
-    :param window: number of episodes in the running mean
     :return: the image file
     :raises ValueError: if the folder is no run folder, or a file in it is damaged
     """
@@ -396,10 +391,10 @@ def plot_training(folder: Path, output: Path | None = None, window: int = 20) ->
         axes = figure.add_subplot()
         ends = []
         if run.episodes is not None and len(run.episodes.steps):
-            steps, mean = episode_curve(run, "steps", "reward", window)
+            steps, mean = episode_curve(run, "steps", "reward", window=20)
             axes.plot(run.episodes.steps, run.episodes.returns, ".", color=COLORS[0], alpha=0.3, markersize=4, linewidth=0)
             axes.plot(steps, mean, **line_style(0))
-            ends.append((f"training,\nmean of {window}", float(mean[-1]), line_style(0)))
+            ends.append(("training,\nmean of 20", float(mean[-1]), line_style(0)))
         if run.evaluations is not None and len(run.evaluations.steps):
             returns = run.evaluations.returns
             axes.errorbar(

@@ -3,7 +3,6 @@
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import Affine2D, BboxTransformTo, ScaledTranslation
+from scipy.optimize import isotonic_regression
 
 from sb3_symphony.common.files import completed
 
@@ -87,7 +87,7 @@ def line_style(index: int) -> dict[str, Any]:
     :param index: of a group of runs, from 0 on
     :return: colour and dashes, of which there are 42 pairs
     """
-    return {"color": next(islice(cycle(COLORS), index, None)), "linestyle": next(islice(cycle(DASHES), index, None))}
+    return {"color": COLORS[index % len(COLORS)], "linestyle": DASHES[index % len(DASHES)]}
 
 
 def note(figure: Figure, text: str) -> None:
@@ -113,17 +113,14 @@ def spread(positions: Sequence[float], sizes: Sequence[float]) -> np.ndarray:
     order = np.argsort(positions, kind="stable")
     extents = np.array(sizes, dtype=float)[order]
     offsets = np.cumsum(extents) - extents / 2
-    # What is left of a position without all that comes before may not fall: neighbours where it does are averaged
-    clusters: list[list[float]] = []
-    for wish in np.array(positions, dtype=float)[order] - offsets:
-        clusters.append([wish])
-        while len(clusters) > 1 and np.mean(clusters[-2]) > np.mean(clusters[-1]):
-            *_, before, last = clusters
-            clusters[-2:] = [before + last]
+    if not len(order):
+        return offsets
+    # What is left of a position without all that comes before may not fall
+    rising = isotonic_regression(np.array(positions, dtype=float)[order] - offsets).x
     free = 1 - extents.sum()
     lowest, highest = min(0.0, free / 2), max(free, free / 2)
     result = np.empty_like(offsets)
-    result[order] = offsets + np.clip([np.mean(cluster) for cluster in clusters for _ in cluster], lowest, highest)
+    result[order] = offsets + np.clip(rising, lowest, highest)
     return result
 
 

@@ -39,31 +39,6 @@ def _is_uniform(fade_factor: float | None) -> bool:
     return fade_factor is None or math.isinf(fade_factor)
 
 
-def fade_weights(size: int, fade_factor: float | None = 7.0, fade_power: float = 2.0) -> np.ndarray:
-    """
-    Probability of every stored transition under fading replay, by the direct formula p_i ∝ tanh(f·(i/n)^power).
-
-    The oldest transition (i = 0) has probability exactly 0, the newest (i = n - 1) the largest one. If every weight
-    vanishes (n = 1), the probabilities are uniform. Meant for tests and plots: sampling never builds this array.
-
-    Source: Read, "Dancing like the Inbetweeners: learning to walk with Symphony" (2024), where the power is 2.
-
-    :param size: number n of stored transitions, at least 1
-    :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
-    :param fade_power: power of the normalised age index, > 0
-    :return: float64 array ``(size,)``, oldest first, that sums to 1
-    :raises ValueError: for a size < 1, a fade factor <= 0 or NaN, or a power that is not finite and > 0
-    """
-    _check_fading(fade_factor, fade_power)
-    if size < 1:
-        raise ValueError(f"size={size!r}: expected at least 1 transition")
-    if fade_factor is None or _is_uniform(fade_factor):
-        return np.full(size, 1.0 / size)
-    weights = np.tanh(fade_factor * (np.arange(size) / size) ** fade_power)
-    total = weights.sum()
-    return weights / total if total > 0 else np.full(size, 1.0 / size)
-
-
 @lru_cache(maxsize=64)
 def _acceptance_rate(fade_factor: float, fade_power: float) -> float:
     """Share of draws accepted below for n → ∞: the mean of tanh(f·x^power) over [0, 1], relative to its maximum."""
@@ -73,7 +48,10 @@ def _acceptance_rate(fade_factor: float, fade_power: float) -> float:
 
 def draw_faded_ages(size: int, n_draws: int, fade_factor: float | None, fade_power: float = 2.0) -> np.ndarray:
     """
-    Draw age indices (0 = oldest) with exactly the probabilities of :func:`fade_weights`, with replacement.
+    Draw age indices (0 = oldest) under fading replay, with replacement: exactly with p_i ∝ tanh(f·(i/n)^power), so the oldest
+    transition (i = 0) never and the newest (i = n - 1) most often. If every weight vanishes (n = 1), uniformly.
+
+    Source: Read, "Dancing like the Inbetweeners: learning to walk with Symphony" (2024), where the power is 2.
 
     Rejection: an index drawn uniformly is accepted with probability (its weight / the newest one's weight), so the
     cost of a draw does not depend on the number of stored transitions (1.4 trials per draw for f = 7).

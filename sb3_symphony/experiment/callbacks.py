@@ -172,10 +172,8 @@ class SeededEvaluation(EvalCallback):
         super()._log_success_callback(locals_, globals_)
 
     def _on_step(self) -> bool:
-        if self.eval_freq > 0 and self.n_calls % self.eval_freq == 0:
-            if self.n_calls // self.eval_freq % self.solved_stride and self._solved():
-                return True
-        else:
+        n_due, between = divmod(self.n_calls, self.eval_freq)
+        if between or (n_due % self.solved_stride and self._solved()):
             return True
         self.eval_env.env_method("restart_seeds")
         try:

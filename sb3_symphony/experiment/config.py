@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.plain_yaml import PlainLoader
@@ -180,6 +180,14 @@ def shipped_environments(algo: str) -> list[str]:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
+def _not_zero(value: int) -> int:
+    if value == 0:
+        raise ValueError("expected a whole number greater than 0")
+    return value
+
+
+NotZero = AfterValidator(_not_zero)
+
 #: number of threads, -1: PyTorch's choice; PyTorch dies of far too many
 Threads = Annotated[int, Field(ge=-1, le=1024)]
 
@@ -191,7 +199,7 @@ class TrainOptions(BaseModel):
 
     algo: str = "symphony"
     env: str = "BipedalWalker-v3"
-    n_timesteps: int = Field(default=-1, ge=-1)
+    n_timesteps: Annotated[int, NotZero] = Field(default=-1, ge=-1)
     seed: int = Field(default=-1, ge=-1, lt=2**31)
     log_folder: str = "logs"
     eval_freq: int = Field(default=10_000, ge=-1)
@@ -213,18 +221,11 @@ class TrainOptions(BaseModel):
     n_seeds: int = Field(default=1, ge=1)
     device: str = "auto"
     num_threads: Threads = -1
-    log_interval: int = Field(default=-1, ge=-2)
+    log_interval: Annotated[int, NotZero] = Field(default=-1, ge=-2)
     verbose: int | None = Field(default=None, ge=0, le=2)
     progress: bool | None = None
     quiet: bool = False
     json_file: str | None = None
-
-    @field_validator("n_timesteps", "log_interval")
-    @classmethod
-    def _not_zero(cls, value: int) -> int:
-        if value == 0:
-            raise ValueError("expected a whole number greater than 0")
-        return value
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -17,13 +17,14 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import (
     ConfigError,
+    NotZero,
     Threads,
     TrainOptions,
     entry_name,
@@ -45,7 +46,7 @@ class TuneOptions(BaseModel):
 
     algo: str = "symphony"
     env: str = "BipedalWalker-v3"
-    n_timesteps: int = Field(default=-1, ge=-1)
+    n_timesteps: Annotated[int, NotZero] = Field(default=-1, ge=-1)
     seed: int = Field(default=100, ge=0, lt=2**31 - 1000)
     seeds_per_trial: int = Field(default=3, ge=1, le=1000)
     log_folder: str = "logs"
@@ -58,7 +59,7 @@ class TuneOptions(BaseModel):
     n_evaluations: int = Field(default=20, ge=1)
     eval_episodes: int = Field(default=10, ge=1)
     timeout: float | None = Field(default=None, gt=0)
-    n_jobs: int = Field(default=1, ge=-1)
+    n_jobs: Annotated[int, NotZero] = Field(default=1, ge=-1)
     sampler: Literal["tpe", "random", "gp", "cmaes"] = "tpe"
     pruner: Literal["median", "halving", "hyperband", "none"] = "median"
     storage: str | None = Field(default=None, min_length=1)
@@ -73,13 +74,6 @@ class TuneOptions(BaseModel):
     def _names_a_folder(cls, value: str | None) -> str | None:
         if value is not None and (value in (".", "..") or "/" in value):
             raise ValueError("expected a name, of a folder, too: without '/'")
-        return value
-
-    @field_validator("n_jobs", "n_timesteps")
-    @classmethod
-    def _not_zero(cls, value: int) -> int:
-        if value == 0:
-            raise ValueError("expected a whole number greater than 0")
         return value
 
     @property
