@@ -210,6 +210,7 @@ def test_dry_run(whole, folder, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + len(CELLS) and re.search(r"^td3/Pendulum-v1_0 +queued +0 / 450$", lines[1])
     assert lines[-1] == f"{len(CELLS)} queued" and list(folder.iterdir()) == []
+    assert fails(capsys, "bench", study, "--dry-run", "-f", "x" * 300).endswith("cannot be read — File name too long\n")
     assert main(["bench", study, "--dry-run", "-f", str(whole)]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"{len(CELLS)} done"
 

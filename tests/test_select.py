@@ -148,6 +148,9 @@ def test_statistics_belong_to_models(folder):
     fails("--vecnormalize: 'other.pkl' — no such file", **flags, vecnormalize="other.pkl")
     (run / "best_model_vecnormalize.pkl").unlink()
     assert select(**flags, load_best=True).normalization.name == "vecnormalize.pkl"  # RL Zoo has only this one
+    args = run / "Pendulum-v1" / "args.yml"
+    args.write_text(args.read_text() + "protocol: null\n")  # but this package has one for each model
+    fails("best_model_vecnormalize.pkl are missing", **flags, load_best=True)
     (run / "Pendulum-v1" / "vecnormalize.pkl").unlink()
     fails("was trained with VecNormalize, but its statistics", **flags, load_best=True)
 
@@ -197,6 +200,7 @@ def test_pretrained_agents(folder, capsys):
     assert found.shipped and "no such run in 'logs', this is the agent that comes with" in capsys.readouterr().err
     fails("logs/symphony: no run of symphony on BipedalWalker-v3", load_best=True)  # it has one model only
     fails("runs/symphony: no run of symphony on BipedalWalker-v3", folder="runs")  # asked for elsewhere
+    fails("logs/symphony: no run of symphony on BipedalWalker-v3", exp_id=1)  # one's own have numbers
     own = make_run(folder / "logs", algo="symphony", env="BipedalWalker-v3", files=["BipedalWalker-v3.zip"])
     assert select().model.samefile(own / "BipedalWalker-v3.zip") and not select().shipped
     assert capsys.readouterr().err == ""

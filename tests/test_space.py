@@ -79,6 +79,12 @@ def test_examples_hold_every_choice_and_both_ends(tmp_path):
     ]
 
 
+def test_whole_ends_do_not_hide_a_wish_for_whole_numbers(tmp_path):
+    values = [each for _, each in written(tmp_path, "a: {float: [16, 64]}\nb: {float: [0, 1], step: 0.25}\n").examples()]
+    assert [each["a"] for each in values[:2]] == [16, 64] and 16 < values[2]["a"] < 64 and not values[2]["a"].is_integer()
+    assert [each["b"] for each in values[3:]] == [1, 0.25]
+
+
 def test_what_is_given_is_not_searched(tmp_path):
     text = "tau: {float: [0.1, 0.2]}\ngamma: [1, 2, 3]\nbatch_size: [7]\n"
     space = written(tmp_path, text, hyperparams={"gamma": 0.5, "batch_size": 8})

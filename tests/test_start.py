@@ -32,6 +32,11 @@ from sb3_symphony.experiment.transfer import find_trained, start_from
 pytestmark = pytest.mark.usefixtures("no_figures")
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
+MIRRORED = {
+    "normalize": True,
+    "replay_buffer_class": "FadingReplayBuffer",
+    "replay_buffer_kwargs": {"mirror": {"observation": {"negate": [1, 2]}, "action": {"negate": [0]}}},
+}
 OWN_ENV = """
 import gymnasium as gym
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
@@ -541,6 +546,7 @@ def test_several_seeds(folder, capsys):
     assert same(TD3.load(alone.run.model).policy.state_dict(), b)
     with pytest.raises(ConfigError, match="--n-seeds: 2"):
         train_seeds(options(seed=2**31 - 1, n_seeds=2))
+    assert main([*argv.split(), "--n-seeds", str(2**31)]) == 2 and "n_seeds: 2147483648 — expected" in capsys.readouterr().err
     assert main([*argv.split()[:-1], "-", *small]) == 0
     assert len(json.loads(capsys.readouterr().out)["runs"]) == 3
 
@@ -588,6 +594,23 @@ def test_what_a_dry_run_prints_is_the_same_configuration(folder, algo):
     assert {key: repr(after[key]) for key in before if "noise" not in key and "learning_rate" not in key} == {
         key: repr(value) for key, value in before.items() if "noise" not in key and "learning_rate" not in key
     }
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"log_folder": "file"}, "--log-folder: 'file' cannot be written"),
+        ({"tensorboard_log": "file/x"}, "--tensorboard-log: 'file/x' cannot be written"),
+        ({"hyperparams": {**SMALL, **MIRRORED}}, "mirror: expected observations as they are, not normalised ones"),
+    ],
+)
+@pytest.mark.parametrize("run", [dry_run, train])
+def test_what_a_dry_run_finds(folder, changes, message, run):
+    """All that would stop a run, which writes nothing then, either."""
+    (folder / "file").touch()
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        run(options(**changes))
+    assert [path.name for path in folder.iterdir()] == ["file"]
 
 
 def test_dry_run_of_a_trained_agent():

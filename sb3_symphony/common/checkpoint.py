@@ -17,7 +17,7 @@ import re
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from sb3_symphony.common.checks import check_number, last_line
 from sb3_symphony.common.files import DamagedFile, checked_content, seal, unseal
 from sb3_symphony.common.generators import generator_states, restore_generators
 from sb3_symphony.common.recording import each_copy, is_recorded, restore_vec_env, vec_env_state
-from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, restore_buffer
+from sb3_symphony.common.replay_files import ReplaySegments, Segment, buffer_state, check_buffer, restore_buffer
 from sb3_symphony.common.versions import package_versions, processor
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -203,6 +203,29 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     return None
 
 
+@contextmanager
+def _fitting(checkpoint: Checkpoint) -> Iterator[None]:
+    """Inside the block a model takes up what a checkpoint holds."""
+    try:
+        yield
+    except (RuntimeError, ValueError, TypeError, AttributeError, LookupError) as error:  # PyTorch's, NumPy's
+        raise DoesNotFit(f"the checkpoint at {checkpoint.steps} steps is of another model — {last_line(error)}") from error
+
+
+def check_fit(model: BaseAlgorithm, checkpoint: Checkpoint) -> None:
+    """
+    Look whether a model's networks, whose values they take, and its replay buffer are those of a checkpoint.
+
+    :param model: an algorithm that is to go on from it, before its ``learn()``
+    :param checkpoint: the checkpoint
+    :raises DoesNotFit: if they are not
+    """
+    with _fitting(checkpoint):
+        model.set_parameters(checkpoint.state["parameters"], exact_match=True, device=model.device)
+        if (buffer := getattr(model, "replay_buffer", None)) is not None:
+            check_buffer(buffer, checkpoint.state["buffer"])
+
+
 class ExactCheckpoints(BaseCallback):
     """
     Saves checkpoints while training, and begins by restoring one.
@@ -347,12 +370,10 @@ class ExactCheckpoints(BaseCallback):
         assert model.env is not None
         episodes = state["episodes"] if is_recorded(model.env) else []
         exact = len(episodes) == model.n_envs and all(each_copy(model.env, "replay", episodes))
-        try:
+        with _fitting(checkpoint):
             if self._buffer is not None:
                 restore_buffer(self._buffer, state["buffer"], self.segments)
             restore_training_state(model, state)
-        except (RuntimeError, ValueError, TypeError, AttributeError, LookupError) as error:  # PyTorch's, NumPy's
-            raise DoesNotFit(f"the checkpoint at {checkpoint.steps} steps is of another model — {last_line(error)}") from error
         for key, callback in self._named_callbacks():
             vars(callback).update(state["callbacks"].get(key, {}))
 

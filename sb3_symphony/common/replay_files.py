@@ -183,6 +183,20 @@ def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
     return {"attributes": state, "next row": {name: array[buffer.pos] for name, array in _storage(buffer)}}
 
 
+def check_buffer(buffer: ReplayBuffer, state: dict[str, Any]) -> None:
+    """
+    :param buffer: a buffer
+    :param state: from :func:`buffer_state`, perhaps of another one
+    :raises ValueError: if class or settings differ
+    """
+    if state["attributes"].keys() != buffer_state(buffer)["attributes"].keys():
+        raise ValueError(f"its replay buffer is no {type(buffer).__name__}")
+    for name in sorted((constructor_parameters(type(buffer)).keys() & state["attributes"].keys()) - _MAY_CHANGE):
+        stored, own = state["attributes"][name], vars(buffer)[name]
+        if isinstance(stored, bool | int | float | str | None) and stored != own:
+            raise ValueError(f"{name} of its replay buffer is {stored!r}, not {own!r}")
+
+
 def restore_buffer(buffer: ReplayBuffer, state: dict[str, Any], segments: ReplaySegments) -> None:
     """
     :param buffer: empty buffer of the same class and settings
@@ -191,12 +205,7 @@ def restore_buffer(buffer: ReplayBuffer, state: dict[str, Any], segments: Replay
     :raises ValueError: if class or settings are others
     :raises DamagedFile: if they cannot be read
     """
-    if state["attributes"].keys() != buffer_state(buffer)["attributes"].keys():
-        raise ValueError(f"its replay buffer is no {type(buffer).__name__}")
-    for name in sorted((constructor_parameters(type(buffer)).keys() & state["attributes"].keys()) - _MAY_CHANGE):
-        stored, own = state["attributes"][name], vars(buffer)[name]
-        if isinstance(stored, bool | int | float | str | None) and stored != own:
-            raise ValueError(f"{name} of its replay buffer is {stored!r}, not {own!r}")
+    check_buffer(buffer, state)
     segments.load(buffer)
     for name, value in state["attributes"].items():
         current = getattr(buffer, name, None)

@@ -218,7 +218,7 @@ class TrainOptions(BaseModel):
     gym_packages: list[str] = []
     vec_env: Literal["dummy", "subproc"] = "dummy"
     eval_env_kwargs: dict[str, Any] = {}
-    n_seeds: int = Field(default=1, ge=1)
+    n_seeds: int = Field(default=1, ge=1, lt=2**31)
     device: str = "auto"
     num_threads: Threads = -1
     log_interval: Annotated[int, NotZero] = Field(default=-1, ge=-2)

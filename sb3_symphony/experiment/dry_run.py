@@ -9,7 +9,7 @@ import yaml
 from sb3_symphony.experiment.config import ConfigError, RunConfig, RunSettings, TrainOptions, find_entry
 from sb3_symphony.experiment.decode import RESERVED, argument_types
 from sb3_symphony.experiment.registry import load_algorithm
-from sb3_symphony.experiment.train import effective_config, prepare
+from sb3_symphony.experiment.train import check_folders, effective_config, prepare
 from sb3_symphony.experiment.transfer import find_trained, inherited
 
 #: keys whose items are shown one by one, as each may come from somewhere else
@@ -28,6 +28,7 @@ def dry_run(options: TrainOptions) -> dict[str, tuple[Any, str]]:
         raise ConfigError("--dry-run: --resume takes everything from the run's own config.yml — expected only one of them")
     config = effective_config(options)
     with ExitStack() as cleanup:
+        check_folders(options)
         prepare(options, config, max(options.seed, 0), 0, cleanup)
     return {**_given(options, config), **_defaults(options.algo, config)}
 

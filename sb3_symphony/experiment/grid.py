@@ -117,9 +117,12 @@ def bench(options: BenchOptions) -> BenchResult:
     name = Path(os.path.abspath(path)).parent.name if path.stem == "study" else path.stem
     study = study.model_copy(update={"title": study.title or name})
     folder = Path(options.folder or f"logs/bench/{name}{'_quick' if options.quick else ''}").absolute()
-    if not options.report:
-        _check_kept_study(path, folder)
-    progress = standings(study, path, folder)
+    try:
+        if not options.report:
+            _check_kept_study(path, folder)
+        progress = standings(study, path, folder)
+    except OSError as error:  # no permission to look, or a name that is no name
+        raise ConfigError(f"-f: '{folder}' cannot be read — {error.strerror}") from None
     if options.dry_run:
         from sb3_symphony.experiment.grid_view import plain_table
 

@@ -199,13 +199,16 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
         env_kwargs = {}  # of another environment
     settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": env_kwargs})
     settings = settings.varied(options.env_kwargs, options.env_wrapper)
-    normalization = _normalization(options, model, run, settings)
+    all_in_one = "protocol" not in trained  # RL Zoo has one file for all models of a run, this package one for each
+    normalization = _normalization(options, model, run, settings, all_in_one)
     known = run is not None or options.vecnormalize is not None
     return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None, known)
 
 
-def _normalization(options: SelectOptions, model: Path, run: RunFolder | None, settings: RunSettings) -> Path | None:
-    """Statistics that belong to the model; RL Zoo has only one file for all models of a run."""
+def _normalization(
+    options: SelectOptions, model: Path, run: RunFolder | None, settings: RunSettings, all_in_one: bool
+) -> Path | None:
+    """Statistics that belong to the model."""
     if options.vecnormalize == "none":
         return None
     if options.vecnormalize is not None:
@@ -220,7 +223,7 @@ def _normalization(options: SelectOptions, model: Path, run: RunFolder | None, s
         own = run.normalization_at(steps)
     else:
         own = run.best_normalization if model.stem == "best_model" else run.normalization
-    for path in (own, run.normalization):
+    for path in (own, *[run.normalization] * all_in_one):
         if path.is_file():
             return path
     raise ConfigError(f"{model}: was trained with VecNormalize, but its statistics {own} are missing — see --vecnormalize")
@@ -248,7 +251,8 @@ def _find_run(options: SelectOptions) -> RunFolder:
     env_name = RunFolder.file_name(env_id)
     folder, algo = Path(options.folder), without_folder(algo)
     numbers = RunFolder.numbers(folder / algo, env_name)
-    if not numbers and options.folder == SelectOptions.model_fields["folder"].default and not _which_of_run(options):
+    by_default = options.folder == SelectOptions.model_fields["folder"].default and options.exp_id == 0
+    if not numbers and by_default and not _which_of_run(options):
         shipped = pretrained_folder()
         numbers = RunFolder.numbers(shipped / algo, env_name)
         if numbers:

@@ -150,7 +150,9 @@ class Interval:
 
     def examples(self) -> list[Any]:
         """:return: values that show whether all are allowed"""
-        return [self.low, self.high]
+        whole = isinstance(self.low, float) and self.low.is_integer() and float(self.high).is_integer()
+        between = self.low + (self.step or (self.high - self.low) / math.e)  # not whole either, unless the step is
+        return [self.low, self.high, *[between] * whole]
 
     def plain(self) -> Any:
         """:return: how YAML has it"""

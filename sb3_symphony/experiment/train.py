@@ -17,7 +17,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_symphony.common.checkpoint import Checkpoint, DoesNotFit, ExactCheckpoints, platform_of
+from sb3_symphony.common.buffers import check_mirror
+from sb3_symphony.common.checkpoint import Checkpoint, DoesNotFit, ExactCheckpoints, check_fit, platform_of
 from sb3_symphony.experiment.agent import check_device
 from sb3_symphony.experiment.callbacks import (
     NoteLogFolder,
@@ -133,7 +134,9 @@ def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: in
         _check_goals(env, options.env, arguments.get("replay_buffer_class"))
         if options.tensorboard_log:
             arguments["tensorboard_log"] = str(Path(options.tensorboard_log) / RunFolder.file_name(options.env))
-        return algorithm(env=env, seed=seed, device=options.device, verbose=verbose, **arguments)
+        model = algorithm(env=env, seed=seed, device=options.device, verbose=verbose, **arguments)
+        check_mirror(getattr(model, "replay_buffer", None), model.get_vec_normalize_env())  # else seen after the warm-up
+        return model
     except Exception as error:  # SB3, or a class that the configuration names, can refuse a value in any way
         env.close()
         if isinstance(error, ConfigError):
@@ -298,6 +301,21 @@ def prepare(
     return model, options, evaluation_env, callbacks
 
 
+def check_folders(options: TrainOptions, folder: Path | None = None, begins: bool = True) -> None:
+    """
+    Look whether all folders can be written into.
+
+    :param options: options of the command line
+    :param folder: run folder to make instead of the next free one
+    :param begins: whether the run's folder is to be made; else it is there, perhaps somewhere else
+    :raises ConfigError: if one cannot
+    """
+    if begins:
+        check_folder(options.log_folder if folder is None else folder.parent, "--log-folder")
+    if options.tensorboard_log:
+        check_folder(options.tensorboard_log, "--tensorboard-log")
+
+
 def train_seeds(options: TrainOptions, command: str | None = None) -> list[TrainResult]:
     """
     Train ``n_seeds`` agents one after the other, on the seeds from the given one on. A signal ends the series.
@@ -366,10 +384,7 @@ def _train(
     if options.num_threads > 0:
         th.set_num_threads(options.num_threads)
 
-    if run is None:  # else it may have been moved, and its folder is there
-        check_folder(options.log_folder if folder is None else folder.parent, "--log-folder")
-    if options.tensorboard_log:
-        check_folder(options.tensorboard_log, "--tensorboard-log")
+    check_folders(options, folder, begins=run is None)
     model, options, evaluation_env, own_callbacks = prepare(options, config, seed, verbose, cleanup, checkpoint is None)
     env = model.get_env()
     assert env is not None
@@ -385,6 +400,8 @@ def _train(
         if options.seed < 0:
             command += f" --seed {seed}"  # so that the command repeats this run
     else:
+        if checkpoint is not None:
+            check_fit(model, checkpoint)  # before any file changes
         beginning = f" ({_resuming(checkpoint, model)})"
         command = f"{run.command}\n{command}".lstrip()
         restore_files(run, checkpoint)
