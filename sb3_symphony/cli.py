@@ -141,7 +141,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _add_quiet(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quiet", dest="silent", action="store_true", help="print nothing but errors")
+    parser.add_argument("--quiet", dest="silent", action="store_true", help="print nothing but errors and notes")
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
@@ -212,7 +212,7 @@ def _add_train(commands: Any) -> None:
     add("--log-interval", type=_whole_number, metavar="N", help="episodes between log lines, -1: default, -2: none")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
     add("--verbose", type=int, choices=(0, 1, 2), help="log to the terminal (default: 1, with a progress bar 0)")
-    add("--quiet", action="store_true", help="print nothing but errors")
+    add("--quiet", action="store_true", help="print nothing but errors and notes")
     add("--json", dest="json_file", metavar="OUT", help="write results as JSON; -: print them so, and nothing else")
     add("--dry-run", action="store_true", help="only print the configuration, and where each value is from")
     parser.set_defaults(run=_train, parser=parser)

@@ -81,6 +81,8 @@ def test_pairs():
     }
     with pytest.raises(ConfigError, match=r"a=1.*key:value"):
         parse_pairs(["a=1"], "-p")
+    with pytest.raises(ConfigError, match="-p: a is given twice, 1 and 2"):
+        parse_pairs(["a:1", "b:1", "a:2"], "-p")
 
 
 def test_zoo_expressions():

@@ -110,7 +110,10 @@ def parse_pairs(pairs: list[str], flag: str) -> dict[str, Any]:
         key, colon, value = pair.partition(":")
         if not (key and colon):
             raise ConfigError(f"{flag}: '{pair}' — expected key:value, such as learning_rate:1e-3")
-        values[key.strip()] = parse_yaml(value, f"{flag} {key}")
+        key = key.strip()
+        if key in values:
+            raise ConfigError(f"{flag}: {key} is given twice, {values[key]!r} and {value} — expected one of them")
+        values[key] = parse_yaml(value, f"{flag} {key}")
     return values
 
 
