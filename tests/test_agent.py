@@ -348,6 +348,7 @@ def test_other_mistakes(folder):
     saved("sac", "Pendulum-v1", policy_kwargs={"net_arch": [8]})
     for changes, message in (
         ({"gym_packages": ["no_such_module"]}, "--gym-packages: 'no_such_module' cannot be imported"),
+        ({"gym_packages": ["./robots/my_env.py"]}, "no file: did you mean 'robots.my_env'?"),
         ({"device": "quantum"}, "--device: 'quantum' is not there"),
         ({"device": "meta"}, "--device: 'meta' is not there"),
         ({"env": "Pendulum-v9"}, "did you mean 'Pendulum-v1'"),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -179,6 +179,10 @@ def import_packages(names: list[str]) -> None:
     :raises ConfigError: for the first one that cannot be imported
     """
     for name in names:
+        file = PurePath(name)
+        if file.suffix == ".py" or len(file.parts) > 1:
+            near = ".".join(file.with_suffix("").parts).lstrip("/.")
+            raise ConfigError(f"--gym-packages: '{name}' — expected the name of a module, no file: did you mean '{near}'?")
         try:
             import_module(name)
         except Exception as error:  # whatever the module does
