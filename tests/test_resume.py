@@ -427,6 +427,11 @@ def test_not_a_run(folder, capsys):
         assert main(["train", "--resume", name]) == 2
         assert message in capsys.readouterr().err
     assert list(folder.iterdir()) == [folder / "empty"]
+    (folder / "zoo" / "Pendulum-v1").mkdir(parents=True)
+    arguments = "!!python/object/apply:collections.OrderedDict [[[algo, td3], [env, Pendulum-v1], [max_total_trials, null]]]"
+    (folder / "zoo" / "Pendulum-v1" / "args.yml").write_text(arguments)
+    assert main(["train", "--resume", "zoo"]) == 2
+    assert "--resume: 'zoo' has no checkpoints — RL Zoo made it" in capsys.readouterr().err
 
 
 def test_run_without_checkpoints(monkeypatch, capsys):

@@ -105,7 +105,7 @@ def parse_pairs(pairs: list[str], flag: str) -> dict[str, Any]:
     :param flag: the flag, for messages
     :return: keys and plain values
     """
-    values = {}
+    values: dict[str, Any] = {}
     for pair in pairs:
         key, colon, value = pair.partition(":")
         if not (key and colon):

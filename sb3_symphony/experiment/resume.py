@@ -19,7 +19,7 @@ from sb3_symphony.common.checkpoint import Checkpoint, checkpoint_files, newest_
 from sb3_symphony.common.files import DamagedFile, write_atomically
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
 from sb3_symphony.experiment.registry import without_folder
-from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.run_folder import RunFolder, is_zoo_run
 
 #: options that may differ from those the run was started with. Schedules depend on the first of them, rounding on the
 #: device, results on no other
@@ -133,6 +133,8 @@ def open_run(options: TrainOptions) -> StoredRun:
         raise ConfigError(f"--resume: '{folder}' — {what}; expected one such as logs/symphony/BipedalWalker-v3_1")
     run = RunFolder(folder, found[0].parent.name)
     content = read_yaml(found[0])
+    if is_zoo_run(content):
+        raise ConfigError(f"--resume: '{folder}' has no checkpoints — RL Zoo made it; -i starts a new run from its agent")
     try:
         stored: TrainOptions = validated(TrainOptions, content)
     except ConfigError as error:

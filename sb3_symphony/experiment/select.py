@@ -24,7 +24,7 @@ from sb3_symphony.experiment.config import (
     shipped_folder,
 )
 from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder, without_module
-from sb3_symphony.experiment.run_folder import RunFolder, steps_in_name
+from sb3_symphony.experiment.run_folder import RunFolder, is_zoo_run, steps_in_name
 
 _DEFAULT_ALGO, _DEFAULT_ENV = TrainOptions().algo, TrainOptions().env
 
@@ -199,8 +199,7 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
         env_kwargs = {}  # of another environment
     settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": env_kwargs})
     settings = settings.varied(options.env_kwargs, options.env_wrapper)
-    all_in_one = "protocol" not in trained  # RL Zoo has one file for all models of a run, this package one for each
-    normalization = _normalization(options, model, run, settings, all_in_one)
+    normalization = _normalization(options, model, run, settings, all_in_one=is_zoo_run(trained))
     known = run is not None or options.vecnormalize is not None
     return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None, known)
 
@@ -208,7 +207,7 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
 def _normalization(
     options: SelectOptions, model: Path, run: RunFolder | None, settings: RunSettings, all_in_one: bool
 ) -> Path | None:
-    """Statistics that belong to the model."""
+    """Statistics that belong to the model; RL Zoo has one file for all models of a run, this package one for each."""
     if options.vecnormalize == "none":
         return None
     if options.vecnormalize is not None:
