@@ -13,12 +13,13 @@ from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import SubprocVecEnv
 from torch import nn
 
 from sb3_symphony import REDQ, DroQ, Symphony
 from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
-from sb3_symphony.common.ensembles import TARGET_MODES
+from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.layers import LeakySine
 from sb3_symphony.common.losses import ACTOR_LOSSES, CRITIC_LOSSES
 from sb3_symphony.common.noise import (
@@ -379,6 +380,52 @@ def test_default_buffers(small):
     for cls in (REDQ, DroQ):
         assert type(small(cls).replay_buffer) is ReplayBuffer
         assert type(small(cls, n_steps=3).replay_buffer) is NStepReplayBuffer
+
+
+class HalfDemonstrations(ReplayBuffer):
+    """Half of each minibatch comes from elsewhere, told by its rewards; knows no time limits."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        del self.timeouts
+        self.handle_timeout_termination = False
+
+    def _get_samples(self, batch_inds: np.ndarray, env: Any = None) -> ReplayBufferSamples:
+        stored = (self.observations, self.actions, self.next_observations, self.dones[..., None], self.rewards[..., None])
+        return ReplayBufferSamples(*(self.to_torch(each[batch_inds, 0]) for each in stored))
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+        own, given = (super(HalfDemonstrations, self).sample(batch_size // 2, env) for _ in range(2))
+        given = given._replace(rewards=th.full_like(given.rewards, 1000.0))
+        return ReplayBufferSamples(*(None if a is None else th.cat([a, b]) for a, b in zip(own, given, strict=True)))
+
+
+def test_minibatches_are_as_a_users_buffer_draws_them(make, monkeypatch):
+    model = make(replay_buffer_class=HalfDemonstrations, gradient_steps=4)
+    shares, fit = [], model._fit_critics
+    monkeypatch.setattr(
+        model, "_fit_critics", lambda batch, *args: shares.append((batch.rewards == 1000).float().mean()) or fit(batch, *args)
+    )
+    model.learn(25)
+    model.learn(25)
+    assert len(shares) > 20 and set(map(float, shares)) == {0.5}
+
+
+def test_critics_of_ones_own(make):
+    """What a subclass computes is what is learned; critics that replace others are learned from then on."""
+
+    class Zero(EnsembleCritic):
+        def forward(self, *args: Any, **kwargs: Any) -> th.Tensor:
+            return 0 * super().forward(*args, **kwargs)
+
+    model = make().learn(25)
+    for kind, learned in ((Zero, False), (EnsembleCritic, True)):
+        model.policy.critic = model.critic = model.policy.make_critic()
+        model.critic.__class__ = kind
+        model.critic.optimizer = th.optim.Adam(model.critic.parameters(), 1e-3)
+        before = weights(model.critic)
+        model.learn(5, reset_num_timesteps=False)
+        assert th.equal(before, weights(model.critic)) != learned
 
 
 def test_priorities_follow_the_errors(make):

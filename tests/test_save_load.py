@@ -287,7 +287,8 @@ def test_policy_kwargs_as_custom_objects(make, algorithm, tmp_path):
     """Those of the user, without what the constructor has added to them."""
     model = make(n_critics=3).learn(40)
     model.save(tmp_path / "model")
-    own = {name: value for name, value in model.policy_kwargs.items() if name not in ("n_critics", "use_sde")}
+    added = ("n_critics", "use_sde", "dropout_rate", "layer_norm")
+    own = {name: value for name, value in model.policy_kwargs.items() if name not in added}
     loaded = algorithm.load(tmp_path / "model", custom_objects=dict(policy_kwargs=own))
     assert loaded.critic.n_critics == 3 and "n_critics" not in own
     with pytest.raises(ValueError, match="n_critics=3: the saved model has 4"):

@@ -381,7 +381,7 @@ def end_trajectory(buffer: ReplayBuffer) -> None:
         with warnings.catch_warnings():  # SB3's advice is for a buffer that was loaded
             warnings.simplefilter("ignore", UserWarning)
             buffer.truncate_last_trajectory()
-    else:
+    elif hasattr(buffer, "timeouts"):  # one's own buffers may do without
         last = buffer.pos - 1
         if not buffer.optimize_memory_usage:  # else the next observation will be that of another episode
             buffer.timeouts[last] = np.logical_or(buffer.timeouts[last], buffer.dones[last] == 0)

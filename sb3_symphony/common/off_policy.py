@@ -24,6 +24,8 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import (
     FadedSampling,
+    FadingDictReplayBuffer,
+    FadingReplayBuffer,
     PrioritizedReplayBuffer,
     check_mirror,
     end_trajectory,
@@ -38,6 +40,9 @@ from sb3_symphony.common.regression import make_regression
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
 MAX_SAMPLE_BYTES = 2**26  # of observations drawn at once: vectors need one draw per call of train(), images several
 MAX_SEGMENT_ROWS = 1024  # of next actions computed at once: activations that fit the cache, not fresh pages of memory
+# Rows of their samples are drawn alike, so one draw may serve several updates. Not so hindsight's (those with their real goal
+# come first), priorities (which change with every update) and what users derive, perhaps to mix sources within a minibatch
+DRAWN_AT_ONCE = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, FadingReplayBuffer, FadingDictReplayBuffer)
 
 
 #: log key (without ``train/``) to tensors of one shape, one for each of the latest updates of a ``train()`` call
@@ -284,7 +289,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
         # SB3 writes it only if it handles timeouts, end_trajectory() always: a row overwritten later would keep it
-        replay_buffer.timeouts[replay_buffer.pos] = 0
+        if hasattr(replay_buffer, "timeouts"):  # one's own buffers may do without
+            replay_buffer.timeouts[replay_buffer.pos] = 0
         super()._store_transition(replay_buffer, *args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
@@ -311,8 +317,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         assert self.replay_buffer is not None
         row_bytes = 8 * get_flattened_obs_dim(self.observation_space)  # two observations in single precision
         updates_per_draw = max(1, MAX_SAMPLE_BYTES // (row_bytes * batch_size))
-        if isinstance(self.replay_buffer, HerReplayBuffer | PrioritizedReplayBuffer):
-            # Samples with their real goal come first, not to be cut; priorities change with every update
+        if type(self.replay_buffer) not in DRAWN_AT_ONCE:
             updates_per_draw = 1
         # With gSDE each update has noise of its own, as in SAC; batch normalisation has statistics of its own
         longest = 1 if self.use_sde or self._has_batch_norm else max(1, MAX_SEGMENT_ROWS // batch_size)
@@ -338,6 +343,8 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         :param logs: Where to add what is logged
         :param sample_kwargs: Passed to ``replay_buffer.sample``
         """
+        if self._regression.critic is not self.critic or self._regression.critic_target is not self.critic_target:
+            self._create_regression()  # somebody has replaced them
         state = self._recorded_state()
         for segment, batches in self._segments(gradient_steps, batch_size, **sample_kwargs):
             if state is None:

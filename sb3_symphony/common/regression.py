@@ -118,7 +118,9 @@ class CriticRegression:
         :param weights: Importance weights ``(batch, 1)`` of a prioritised replay
         :return: The loss and the critics' values before the step
         """
-        outputs = self.critic.outputs(observations, actions)  # (n_critics, batch, 1 or n_bins)
+        # By calling the module, unless bins become a value there: so a subclass's forward() counts, and hooks do
+        compute = self.critic if self.critic.bins is None else self.critic.outputs
+        outputs = compute(observations, actions)  # (n_critics, batch, 1 or n_bins)
         loss = self.objective.loss(outputs, target, weights).sum()
 
         self.critic.optimizer.zero_grad()

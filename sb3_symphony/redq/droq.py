@@ -88,12 +88,17 @@ class DroQ(REDQ):
             use_sde_at_warmup,
             stats_window_size,
             tensorboard_log,
-            {"dropout_rate": 0.01, "layer_norm": True, **(policy_kwargs or {})},
+            policy_kwargs,
             verbose,
             seed,
             device,
             _init_setup_model,
         )
+
+    def _setup_model(self) -> None:
+        # Here, as load() may have been given policy_kwargs of one's own
+        self.policy_kwargs = {"dropout_rate": 0.01, "layer_norm": True, **self.policy_kwargs}
+        super()._setup_model()
 
     def learn(
         self: SelfDroQ,
