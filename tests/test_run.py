@@ -400,6 +400,17 @@ class HalfDemonstrations(ReplayBuffer):
         return ReplayBufferSamples(*(None if a is None else th.cat([a, b]) for a, b in zip(own, given, strict=True)))
 
 
+class Counted(FadingReplayBuffer):
+    """With SB3's ``sample``, as users write it."""
+
+    def sample(self, batch_size: int, env: Any = None) -> Any:
+        return super().sample(batch_size, env)
+
+
+def test_a_fading_buffer_of_ones_own(make):
+    assert make(replay_buffer_class=Counted).learn(40)._n_updates > 0
+
+
 def test_minibatches_are_as_a_users_buffer_draws_them(make, monkeypatch):
     model = make(replay_buffer_class=HalfDemonstrations, gradient_steps=4)
     shares, fit = [], model._fit_critics

@@ -295,6 +295,15 @@ def test_policy_kwargs_as_custom_objects(make, algorithm, tmp_path):
         algorithm.load(tmp_path / "model", custom_objects=dict(policy_kwargs={**own, "n_critics": 4}))
 
 
+def test_policy_kwargs_that_built_the_model(make, algorithm, tmp_path):
+    """SB3 saves plain ones as JSON, which knows no tuples."""
+    own = dict(net_arch=[16, 16], layer_norm=(True, False))
+    make(policy_kwargs=own).save(tmp_path / "model")
+    assert algorithm.load(tmp_path / "model", policy_kwargs=own).policy_kwargs["layer_norm"] == [True, False]
+    with pytest.raises(ValueError, match="layer_norm="):
+        algorithm.load(tmp_path / "model", policy_kwargs={**own, "layer_norm": (True, True)})
+
+
 def test_arguments_given_to_load(make, algorithm, tmp_path):
     model = make().learn(40)
     model.save(tmp_path / "model")

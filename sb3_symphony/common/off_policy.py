@@ -496,7 +496,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         for name, value in policy_kwargs.items():
             saved = model.policy_kwargs.get(name, getattr(model.policy, name, None))
-            if value != saved:
+            if _without_tuples(value) != _without_tuples(saved):  # SB3 saves them as JSON
                 raise ValueError(f"policy_kwargs has {name}={value!r}: the saved model has {saved!r}")
         if "_stats_window_size" in kwargs:
             model.ep_info_buffer = deque(model.ep_info_buffer or (), model._stats_window_size)
@@ -542,6 +542,13 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def _without_tuples(value: Any) -> Any:
+    """With lists instead, as JSON has it."""
+    if isinstance(value, dict):
+        return {key: _without_tuples(each) for key, each in value.items()}
+    return [_without_tuples(each) for each in value] if isinstance(value, tuple | list) else value
 
 
 def _rows(samples: ReplayBufferSamples, start: int, length: int) -> Any:

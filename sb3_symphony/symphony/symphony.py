@@ -1,3 +1,4 @@
+import inspect
 import zlib
 from typing import Any, ClassVar, TypeVar
 
@@ -11,7 +12,7 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_symphony.common.buffers import FadedSampling, FadingDictReplayBuffer, FadingReplayBuffer
+from sb3_symphony.common.buffers import FadingDictReplayBuffer, FadingReplayBuffer
 from sb3_symphony.common.checks import check_choice, check_number, check_pair
 from sb3_symphony.common.ensembles import combine
 from sb3_symphony.common.losses import ACTOR_LOSSES
@@ -226,7 +227,7 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         logs = update_logs()
         if self._n_updates == 0:
             uniform, faded = self.initial_gradient_steps
-            fades = isinstance(self.replay_buffer, FadedSampling)
+            fades = "uniform" in inspect.signature(self.replay_buffer.sample).parameters  # so others are uniform, or one's own
             self._update(uniform, batch_size, logs, **({"uniform": True} if fades else {}))
             self._update(faded, batch_size, logs)
         self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
