@@ -227,7 +227,8 @@ class Symphony(EnsembleOffPolicyAlgorithm):
         logs = update_logs()
         if self._n_updates == 0:
             uniform, faded = self.initial_gradient_steps
-            fades = "uniform" in inspect.signature(self.replay_buffer.sample).parameters  # so others are uniform, or one's own
+            # Buffers without fading are uniform, and one's own draw as they do
+            fades = "uniform" in inspect.signature(type(self.replay_buffer).sample).parameters
             self._update(uniform, batch_size, logs, **({"uniform": True} if fades else {}))
             self._update(faded, batch_size, logs)
         self._update(gradient_steps + self._new_episodes * self.episode_gradient_steps, batch_size, logs)
