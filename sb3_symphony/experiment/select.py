@@ -222,7 +222,7 @@ def _normalization(
         own = run.normalization_at(steps)
     else:
         own = run.best_normalization if model.stem == "best_model" else run.normalization
-    for path in (own, *[run.normalization] * all_in_one):
+    for path in (own, run.normalization) if all_in_one else (own,):
         if path.is_file():
             return path
     raise ConfigError(f"{model}: was trained with VecNormalize, but its statistics {own} are missing — see --vecnormalize")
