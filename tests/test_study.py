@@ -267,6 +267,12 @@ def test_algorithms_of_a_file(write, tmp_path):
             },
             "start_from: td3 has no seed 0",
         ),
+        (
+            {"algorithms": [{"name": "td3", "overrides": {"n_timesteps": 100}}]},
+            "overrides: 'n_timesteps' — a study calls it steps, of an algorithm, an environment or all",
+        ),
+        ({"environments": [{"id": WALKER, "overrides": {"n_timesteps": 100}}]}, "overrides: 'n_timesteps' — a study"),
+        ({"quick": {"overrides": {"n_timesteps": 100}}}, "quick: overrides: 'n_timesteps' — a study"),
         ({"sweeps": {"s": {"algo": "tdd3"}}}, "sweeps: s: unknown algorithm 'tdd3'"),
         ({"sweeps": {"s": {"algo": "td3", "n_jobs": 2}}}, "sweeps: 'n_jobs' — is for the command line"),
         ({"sweeps": {"s": {"algo": "td3", "n_trails": 2}}}, "sweeps: unknown option 'n_trails': did you mean 'n_trials'?"),

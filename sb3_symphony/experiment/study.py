@@ -73,6 +73,15 @@ _List = Annotated[list[_Item], BeforeValidator(_some)]
 _Seeds = Annotated[_List[Annotated[int, Field(ge=0, lt=2**31)]], BeforeValidator(_seeds)]
 
 
+def _overrides(value: Any) -> Any:
+    if isinstance(value, dict) and "n_timesteps" in value:
+        raise ConfigError("'n_timesteps' — a study calls it steps, of an algorithm, an environment or all")
+    return value
+
+
+_Overrides = Annotated[dict[str, Any], BeforeValidator(_overrides)]
+
+
 def _check_name(value: str) -> None:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._+-]*", value):
         raise ValueError("expected letters, digits and . _ + - (it names a folder)")
@@ -116,7 +125,7 @@ class Algorithm(BaseModel):
     algo: str = ""
     conf: str | None = None
     sweep: str | None = None
-    overrides: dict[str, Any] = {}
+    overrides: _Overrides = {}
     steps: Count | None = None
     seeds: _Seeds | None = None
     environments: _List[str] | None = None
@@ -155,7 +164,7 @@ class Environment(BaseModel):
 
     id: str
     env_kwargs: dict[str, Any] = {}
-    overrides: dict[str, Any] = {}
+    overrides: _Overrides = {}
     threshold: FiniteFloat | None = None
     unstable_below: FiniteFloat | None = None
     steps: Count | None = None
@@ -245,7 +254,7 @@ class Quick(BaseModel):
     protocol: _AnyProtocol | None = None
     final_episodes: Whole | None = None
     save_freq: Count | None = None
-    overrides: dict[str, Any] = {}
+    overrides: _Overrides = {}
     sweeps: dict[str, Any] = {}
 
 
