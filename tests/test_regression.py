@@ -12,6 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_symphony import REDQ, Symphony
+from sb3_symphony.common import products
 from sb3_symphony.common.ensembles import EnsembleCritic
 from sb3_symphony.common.layers import LeakySine, StackedLinear
 from sb3_symphony.common.losses import CRITIC_LOSSES
@@ -744,9 +745,11 @@ def test_choice_of_the_engine(small, algorithm):
         small(algorithm, policy_kwargs=dict(critic_engine="fast"))
 
 
+@pytest.mark.parametrize("tiles", [False, True])
 @pytest.mark.parametrize("policy_kwargs", [{}, dict(dropout_rate=0.1, layer_norm=True)])
-def test_both_engines_learn_the_same(small, algorithm, policy_kwargs):
-    """A short run of each algorithm, in single precision."""
+def test_both_engines_learn_the_same(small, algorithm, policy_kwargs, tiles, monkeypatch):
+    """A short run of each algorithm, in single precision, with products by torch and by compiled tiles."""
+    monkeypatch.setattr(products, "tiles_are_faster", lambda: tiles)
     weights = []
     for engine in ("autograd", "fused"):
         model = small(algorithm, policy_kwargs=dict(policy_kwargs, critic_engine=engine)).learn(60)

@@ -7,8 +7,8 @@ networks of this size that costs more than the matrix products. Here torch makes
 """
 
 import operator
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache, partial
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from sb3_symphony.common.kernels import (
     output_forward,
 )
 from sb3_symphony.common.layers import Dropout, LeakySine, StackedLayerNorm, StackedLinear, draw_dropped
+from sb3_symphony.common.products import Operands, all_members, array, products_of
 
 aten = th.ops.aten
 
@@ -85,105 +86,7 @@ def are_same(objects: Sequence[Any], others: Sequence[Any]) -> bool:
     return len(objects) == len(others) and all(map(operator.is_, objects, others))
 
 
-def array(tensor: th.Tensor) -> np.ndarray:
-    """The same memory, as the kernels take it."""
-    return tensor.detach().numpy()
-
-
-@cache
-def all_members(n: int) -> np.ndarray:
-    """Indices ``(n,)`` of all networks in their order: always the same array, so that asking for it costs no comparison."""
-    return np.arange(n)
-
-
 NOTHING = np.zeros(0, dtype=np.int64)  # positions of what is dropped where nothing is
-
-
-class Products:
-    """
-    The products of a hidden layer: with its weights, and the two of its backward pass.
-
-    :param weight: ``(n_members, in_features, width)``
-    """
-
-    def __init__(self, weight: th.Tensor) -> None:
-        self.weight = weight
-        self._all_members = all_members(weight.shape[0])
-
-    def forward(self, x: th.Tensor, members: np.ndarray, out: th.Tensor) -> None:
-        """
-        :param x: ``(n, batch, in_features)``
-        :param members: Indices ``(n,)`` of the networks to compute
-        :param out: Where to write the result ``(n, batch, width)``
-        """
-        if members is self._all_members:
-            th.bmm(x, self.weight, out=out)
-        else:  # one by one, rather than gather the weights first
-            for k, each, result in zip(members.tolist(), x, out, strict=True):
-                th.mm(each, self.weight[k], out=result)
-
-    def backward(self, x: th.Tensor, grad: th.Tensor, grad_weight: th.Tensor | None, grad_input: th.Tensor | None) -> None:
-        """
-        Of all members.
-
-        :param x: The same as in ``forward``
-        :param grad: Gradient with respect to the product ``(n_members, batch, width)``
-        :param grad_weight: Where to write that with respect to the weights, if it is wanted
-        :param grad_input: Where to write that with respect to ``x``, if it is wanted
-        """
-        if grad_weight is not None:
-            th.bmm(x.transpose(1, 2), grad, out=grad_weight)
-        if grad_input is not None:
-            th.bmm(grad, self.weight.transpose(1, 2), out=grad_input)
-
-
-class BFloat16Products(Products):
-    """
-    The same on operands rounded to bfloat16; sums are in single precision, results rounded.
-
-    Twice as fast where the processor has such arithmetic, several times slower where it has not.
-
-    :param weight: ``(n_members, in_features, width)``
-    :param batch_size: Rows of the input
-    """
-
-    def __init__(self, weight: th.Tensor, batch_size: int) -> None:
-        super().__init__(weight)
-        n_members, in_features, width = weight.shape
-
-        def rounded(*shape: int) -> th.Tensor:
-            return th.zeros(n_members, *shape, dtype=th.bfloat16)
-
-        self.operands = rounded(batch_size, in_features), rounded(in_features, width), rounded(batch_size, width)
-        self.results = rounded(batch_size, in_features), rounded(in_features, width), rounded(batch_size, width)
-
-    def forward(self, x: th.Tensor, members: np.ndarray, out: th.Tensor) -> None:
-        n = len(members)
-        rounded_x, weight, product = self.operands[0][:n], self.operands[1][:n], self.results[2][:n]
-        rounded_x.copy_(x)
-        if members is self._all_members:
-            weight.copy_(self.weight)
-        else:
-            for k, each in zip(members.tolist(), weight, strict=True):
-                each.copy_(self.weight[k])
-        out.copy_(th.bmm(rounded_x, weight, out=product))
-
-    def backward(self, x: th.Tensor, grad: th.Tensor, grad_weight: th.Tensor | None, grad_input: th.Tensor | None) -> None:
-        rounded_x, weight, rounded_grad = self.operands  # the first two are still there from the forward pass
-        rounded_grad.copy_(grad)
-        if grad_weight is not None:
-            grad_weight.copy_(th.bmm(rounded_x.transpose(1, 2), rounded_grad, out=self.results[1]))
-        if grad_input is not None:
-            grad_input.copy_(th.bmm(rounded_grad, weight.transpose(1, 2), out=self.results[0]))
-
-
-def _zeros(linear: StackedLinear, batch_size: int) -> th.Tensor:
-    """Memory for the result of a layer, ``(n_members, batch, width)``."""
-    n_members, _, width = linear.weight.shape
-    return linear.weight.detach().new_zeros(n_members, batch_size, width)
-
-
-MIN_ROUNDED = 4096  # weights per member: below, the casts cost more than the products gain
 
 
 class Layer:
@@ -191,11 +94,13 @@ class Layer:
     A linear layer of all members and what follows it.
 
     :param linear: The linear layer
+    :param x: Where its input will be ``(n_members, batch, in_features)``
     """
 
-    def __init__(self, linear: StackedLinear) -> None:
+    def __init__(self, linear: StackedLinear, x: th.Tensor) -> None:
         self.weight = linear.weight.detach()
-        self._n_members = self.weight.shape[0]
+        self._n_members, _, width = self.weight.shape
+        self.out = self.weight.new_zeros(*x.shape[:2], width)  # (n_members, batch, width)
         self.parameters: list[nn.Parameter] = [linear.weight, linear.bias]
         self.grads = [th.zeros_like(parameter).detach() for parameter in self.parameters]
 
@@ -206,6 +111,7 @@ class Hidden(Layer):
 
     What is dropped is what the module drops with the same generator state.
 
+    :param grad_x: Where the gradient with respect to the input is to be, if it is wanted
     :param lender: A layer of the same shape, of another network, whose memory is used; what that has computed is lost then.
         Critics and targets take turns, and what both keep for themselves does not fit a second-level cache
     """
@@ -216,17 +122,15 @@ class Hidden(Layer):
         dropout: Dropout | None,
         norm: StackedLayerNorm | None,
         activation: Activation,
-        batch_size: int,
+        x: th.Tensor,
+        grad_x: th.Tensor | None,
         bfloat16: bool,
         lender: "Hidden | None" = None,
     ) -> None:
-        super().__init__(linear)
+        super().__init__(linear, x)
         self.dropout, self.activation = dropout, activation
-        rounded = bfloat16 and self.weight[0].numel() >= MIN_ROUNDED
-        self.products = BFloat16Products(self.weight, batch_size) if rounded else Products(self.weight)
         if lender is None:
-            # The result, and the gradient with respect to it: (n_members, batch, width)
-            self.out, self.grad = (_zeros(linear, batch_size) for _ in range(2))
+            self.grad = th.zeros_like(self.out)  # with respect to the result
             # LayerNorm and sine need what they were computed from in their backward pass; the others work in place
             keeps_product = norm is not None or activation.code == LEAKY_SINE
             self.product = th.zeros_like(self.out) if keeps_product else self.out
@@ -235,6 +139,7 @@ class Hidden(Layer):
         else:
             self.out, self.grad, self.product = lender.out, lender.grad, lender.product
             self.rstd, self.derivative = lender.rstd, lender.derivative
+        self.products = products_of(Operands(self.weight, x, self.product, self.grad, self.grads[0], grad_x), bfloat16)
         gain = shift = linear.bias  # in place of what the kernel does not use
         if norm is not None:
             gain, shift = norm.weight, norm.bias
@@ -251,87 +156,82 @@ class Hidden(Layer):
         self._backward = partial(layer_backward(*options), grad, product, out, gains, slope, rstd, derivative, *grads)
         self._dropout = self._real(1), NOTHING  # factor of what dropout keeps, positions of what it drops
 
-    def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
+    def forward(self, members: np.ndarray) -> None:
         """
-        :param x: ``(n, batch, in_features)``
-        :param members: Indices ``(n,)`` of the networks to compute
-        :return: ``(n, batch, width)``
+        :param members: Indices ``(n,)`` of the networks to compute; their results are the first ``n``
         """
-        n = len(members)
-        product, out = self.product, self.out
-        if n < self._n_members:
-            product, out = product[:n], out[:n]
-        self.input = x
-        self.products.forward(x, members, product)
+        self.products.forward(members)
         if self.dropout is not None:
             if self.dropout.training and self.dropout.p > 0:
-                self._dropout = self._real(self.dropout.scale), draw_dropped(out.numel(), self.dropout.p)
+                n_results = self.out[0].numel() * len(members)
+                self._dropout = self._real(self.dropout.scale), draw_dropped(n_results, self.dropout.p)
             else:
                 self._dropout = self._real(1), NOTHING
         self._forward(members, *self._dropout)
-        return out if self.activation.forward is None else self.activation.forward(out)
+        if self.activation.forward is not None:
+            self.activation.forward(self.out[: len(members)])
 
-    def backward(self) -> th.Tensor:
+    def backward(self, parameters: bool) -> None:
         """
-        Turn ``grad`` into the gradient with respect to the product, and leave those of all parameters but the weights in
-        ``grads``.
+        Turn ``grad`` into the gradient with respect to the product, then leave that with respect to the input where it was
+        wanted, and those of the parameters in ``grads``.
+
+        :param parameters: Whether that of the weights, which is dear, is wanted
         """
         if self.activation.backward is not None:
             self.activation.backward(self.grad, self.out)
         self._backward(*self._dropout)
-        return self.grad
+        self.products.backward(parameters)
 
 
 class Output(Layer):
     """
     The last layer, with one unit: matrix-vector products.
 
-    :param linear: The linear layer
-    :param batch_size: Rows of its input
+    :param grad_x: Where the gradient with respect to the input is to be
     """
 
-    def __init__(self, linear: StackedLinear, batch_size: int) -> None:
-        super().__init__(linear)
-        self.out = _zeros(linear, batch_size)
+    def __init__(self, linear: StackedLinear, x: th.Tensor, grad_x: th.Tensor) -> None:
+        super().__init__(linear, x)
+        self._x, self._grad_x, self._out = map(array, (x, grad_x, self.out[..., 0]))
         weight, bias, grad_weight, grad_bias = map(array, (*self.parameters, *self.grads))
-        self.weights = weight.reshape(self._n_members, -1), bias.reshape(self._n_members)
-        self.weight_grads = grad_weight.reshape(self._n_members, -1), grad_bias.reshape(self._n_members)
+        self._weights = weight.reshape(self._n_members, -1), bias.reshape(self._n_members)
+        self._weight_grads = grad_weight.reshape(self._n_members, -1), grad_bias.reshape(self._n_members)
 
-    def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
-        """Parameters and return value as in :meth:`Hidden.forward`."""
-        self.input = array(x.contiguous())
-        out = self.out[: len(members)]
-        output_forward(self.input, *self.weights, members, array(out)[..., 0])
-        return out
+    def forward(self, members: np.ndarray) -> th.Tensor:
+        """
+        :param members: As in :meth:`Hidden.forward`
+        :return: ``(n, batch, width)``
+        """
+        n = len(members)
+        output_forward(self._x[:n], *self._weights, members, self._out[:n])
+        return self.out[:n]
 
-    def backward(self, grad: th.Tensor, grad_input: th.Tensor) -> None:
+    def backward(self, grad: th.Tensor, parameters: bool) -> None:
         """
-        :param grad: ``(n_members, batch, 1)``
-        :param grad_input: Where to write the gradient with respect to the input ``(n_members, batch, in_features)``
+        :param grad: ``(n_members, batch, width)``
+        :param parameters: As in :meth:`Hidden.backward`
         """
-        output_backward(array(grad)[..., 0], self.input, self.weights[0], *self.weight_grads, array(grad_input))
+        output_backward(array(grad)[..., 0], self._x, self._weights[0], *self._weight_grads, self._grad_x)
 
 
 class WideOutput(Layer):
     """The last layer, with several units. Parameters and return values as in :class:`Output`."""
 
-    def __init__(self, linear: StackedLinear, batch_size: int) -> None:
-        super().__init__(linear)
-        self.out = _zeros(linear, batch_size)
-        self.bias = linear.bias.detach()
-        self.products = Products(self.weight)
+    def __init__(self, linear: StackedLinear, x: th.Tensor, grad_x: th.Tensor) -> None:
+        super().__init__(linear, x)
+        self._grad = th.zeros_like(self.out)
+        self._bias = linear.bias.detach()
+        self._products = products_of(Operands(self.weight, x, self.out, self._grad, self.grads[0], grad_x))
 
-    def forward(self, x: th.Tensor, members: np.ndarray) -> th.Tensor:
-        self.input = x
-        if members is all_members(self._n_members):  # in their order
-            return th.baddbmm(self.bias, x, self.weight, out=self.out)
-        out = self.out[: len(members)]
-        self.products.forward(self.input, members, out)
-        return out.add_(self.bias[members])
+    def forward(self, members: np.ndarray) -> th.Tensor:
+        self._products.forward(members)
+        return self.out[: len(members)].add_(self._bias[members])
 
-    def backward(self, grad: th.Tensor, grad_input: th.Tensor) -> None:
+    def backward(self, grad: th.Tensor, parameters: bool) -> None:
+        self._grad.copy_(grad)
         th.sum(grad, dim=1, keepdim=True, out=self.grads[1])
-        self.products.backward(self.input, grad, self.grads[0], grad_input)
+        self._products.backward(parameters)
 
 
 class FusedNetwork:
@@ -353,7 +253,9 @@ class FusedNetwork:
         assert isinstance(first, StackedLinear)
         n_members, in_features, _ = first.weight.shape
         self.input = first.weight.new_empty(batch_size, in_features).detach()
+        self.grad_input = self.input.new_empty(n_members, batch_size, in_features)  # written if there are no hidden layers
         self.hidden: list[Hidden] = []
+        x, grad_x = self.input.expand(n_members, -1, -1), None
 
         modules = list(self._layers)
         while len(modules) > 1:
@@ -366,11 +268,12 @@ class FusedNetwork:
             activation = activation_of(following)
             assert isinstance(linear, StackedLinear) and activation is not None
             lending = None if lender is None else lender.hidden[len(self.hidden)]
-            self.hidden.append(Hidden(linear, dropout, norm, activation, batch_size, bfloat16, lending))
+            self.hidden.append(Hidden(linear, dropout, norm, activation, x, grad_x, bfloat16, lending))
+            x, grad_x = self.hidden[-1].out, self.hidden[-1].grad
         (last,) = modules
         assert isinstance(last, StackedLinear)
-        self.output = (Output if last.weight.shape[-1] == 1 else WideOutput)(last, batch_size)
-        self.grad_input = self.input.new_empty(n_members, batch_size, in_features)
+        output = Output if last.weight.shape[-1] == 1 else WideOutput
+        self.output = output(last, x, self.grad_input if grad_x is None else grad_x)
 
         layers: list[Layer] = [*self.hidden, self.output]
         self.parameters = [parameter for layer in layers for parameter in layer.parameters]
@@ -402,10 +305,10 @@ class FusedNetwork:
         :return: ``(n_members, batch, n_outputs)``, valid until the next call
         """
         chosen = all_members(self.grad_input.shape[0]) if members is None else np.array(members)
-        x = th.cat((features, actions), dim=1, out=self.input).expand(len(chosen), -1, -1)
+        th.cat((features, actions), dim=1, out=self.input)
         for layer in self.hidden:
-            x = layer.forward(x, chosen)
-        return self.output.forward(x, chosen)
+            layer.forward(chosen)
+        return self.output.forward(chosen)
 
     def backward(self, grad: th.Tensor) -> None:
         """
@@ -413,8 +316,7 @@ class FusedNetwork:
 
         :param grad: Gradient with respect to the result of ``forward`` ``(n_members, batch, n_outputs)``
         """
-        for layer, grad_input in self._backward_layers(grad):
-            layer.products.backward(layer.input, layer.grad, layer.grads[0], grad_input)
+        self._backward(grad, parameters=True)
 
     def action_gradient(self, grad: th.Tensor, action_dim: int) -> th.Tensor:
         """
@@ -424,20 +326,13 @@ class FusedNetwork:
         :param action_dim: How many of the input's last columns are actions
         :return: ``(batch, action_dim)``
         """
-        for layer, grad_input in self._backward_layers(grad):
-            if grad_input is None:  # the first layer
-                return th.bmm(layer.grad, layer.weight[:, -action_dim:].transpose(1, 2)).sum(dim=0)
-            layer.products.backward(layer.input, layer.grad, None, grad_input)
-        return self.grad_input[..., -action_dim:].sum(dim=0)
+        self._backward(grad, parameters=False)
+        if not self.hidden:
+            return self.grad_input[..., -action_dim:].sum(dim=0)
+        first = self.hidden[0]
+        return th.bmm(first.grad, first.weight[:, -action_dim:].transpose(1, 2)).sum(dim=0)
 
-    def _backward_layers(self, grad: th.Tensor) -> Iterator[tuple[Hidden, th.Tensor | None]]:
-        """
-        Hidden layers from last to first, once what comes after their products has been gone through.
-
-        With each, where the caller is to write the gradient with respect to its input; ``None`` for the first layer.
-        """
-        below = [None, *(layer.grad for layer in self.hidden)]
-        self.output.backward(grad, self.grad_input if below[-1] is None else below[-1])
-        for layer, grad_input in zip(reversed(self.hidden), reversed(below[:-1]), strict=True):
-            layer.backward()
-            yield layer, grad_input
+    def _backward(self, grad: th.Tensor, parameters: bool) -> None:
+        self.output.backward(grad, parameters)
+        for layer in reversed(self.hidden):
+            layer.backward(parameters)

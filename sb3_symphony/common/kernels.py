@@ -16,20 +16,29 @@ from functools import cache
 import numpy as np
 from numba import njit
 
+# Sums may be reordered, as in torch; NaN and infinity stay what they are, or a diverged run would look healthy
+_FAST = frozenset({"reassoc", "contract", "arcp", "nsz"})
 
-def _compiler(fastmath: set[str]) -> Callable[[Callable], Callable]:
+
+def compiler(fastmath: frozenset[str] = _FAST, signature: str | None = None) -> Callable[[Callable], Callable]:
+    """
+    A decorator of functions that are to be compiled.
+
+    :param fastmath: What may be changed in the arithmetic, by LLVM's names
+    :param signature: For which types, at once; ``None``: for those it is called with, when it is called first
+    """
+
     def compiled(function: Callable) -> Callable:
         try:
-            return njit(fastmath=fastmath, error_model="numpy", cache=True)(function)
+            return njit(signature, fastmath=set(fastmath), error_model="numpy", cache=True)(function)
         except RuntimeError:  # numba finds no folder it may write to: each process compiles for itself
-            return njit(fastmath=fastmath, error_model="numpy")(function)
+            return njit(signature, fastmath=set(fastmath), error_model="numpy")(function)
 
     return compiled
 
 
-# Sums may be reordered, as in torch; NaN and infinity stay what they are, or a diverged run would look healthy
-_compiled = _compiler({"reassoc", "contract", "arcp", "nsz"})
-_compiled_in_order = _compiler({"contract"})
+compiled = compiler()
+_compiled_in_order = compiler(frozenset({"contract"}))
 
 IDENTITY, LEAKY_RELU, LEAKY_SINE = range(3)
 
@@ -55,7 +64,7 @@ def _sin_cos(x, real):
     return sign * sine * r, sign * cosine
 
 
-@_compiled
+@compiled
 def positions_from_gaps(gaps, last, stop):
     """Turn gaps, in place, into the positions that follow ``last``; returns the latest, and how many are below ``stop``."""
     count = 0
@@ -68,7 +77,7 @@ def positions_from_gaps(gaps, last, stop):
     return last, count
 
 
-@_compiled
+@compiled
 def _mark(factors, value, start, dropped, k):
     """Set the factors of what is dropped of a row that begins at position ``start``, from ``dropped[k]`` on; returns ``k``."""
     while k < dropped.size and dropped[k] < start + factors.size:
@@ -94,7 +103,7 @@ def layer_forward(layer_norm: bool, dropout: bool, activation: int) -> Callable:
     """
     in_place = not layer_norm and activation != LEAKY_SINE
 
-    @_compiled
+    @compiled
     def forward(product, bias, gain, shift, eps, slope, rstd, derivative, out, members, kept, dropped):
         real = product.dtype.type
         batch, width = product.shape[1:]
@@ -149,7 +158,7 @@ def layer_backward(layer_norm: bool, dropout: bool, activation: int) -> Callable
     """
     in_place = not layer_norm and activation != LEAKY_SINE
 
-    @_compiled
+    @compiled
     def backward(grad, normal, out, gain, slope, rstd, derivative, grad_bias, grad_gain, grad_shift, kept, dropped):
         real = grad.dtype.type
         n, batch, width = grad.shape
@@ -197,7 +206,7 @@ def layer_backward(layer_norm: bool, dropout: bool, activation: int) -> Callable
     return backward
 
 
-@_compiled
+@compiled
 def output_forward(x, weight, bias, members, out):
     """
     ``out[s, i] = x[s, i] · weight[members[s]] + bias[members[s]]``: products of width 1, for which BLAS is not made.
@@ -215,7 +224,7 @@ def output_forward(x, weight, bias, members, out):
             out[s, i] = total
 
 
-@_compiled
+@compiled
 def output_backward(grad, x, weight, grad_weight, grad_bias, grad_x):
     """The gradients of :func:`output_forward` with respect to its weights, biases and input."""
     n, batch, width = x.shape
@@ -233,7 +242,7 @@ def output_backward(grad, x, weight, grad_weight, grad_bias, grad_x):
         grad_bias[k] = total
 
 
-@_compiled
+@compiled
 def adam_polyak(parameter, grad, exp_avg, exp_avg_sq, step, target, lr, beta1, beta2, eps, weight_decay, decoupled, tau):
     """One Adam (``decoupled``: AdamW) step of ``parameter``, then a Polyak step of ``target``; arrays flat, in one sweep."""
     real = parameter.dtype.type
