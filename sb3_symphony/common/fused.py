@@ -2,8 +2,8 @@
 Hand-written forward and backward passes of stacked networks on the CPU, in memory that is allocated once.
 
 Autograd allocates every activation anew, keeps a graph and walks it, and sweeps over memory for each small operation; for
-networks of this size that costs more than the matrix products. Here torch makes the products, and the compiled loops of
-:mod:`~sb3_symphony.common.kernels` do what lies between them.
+networks of this size that costs more than the matrix products. Here :mod:`~sb3_symphony.common.products` makes those, and the
+compiled loops of :mod:`~sb3_symphony.common.kernels` do what lies between them.
 """
 
 import operator
@@ -210,7 +210,7 @@ class Output(Layer):
     def backward(self, grad: th.Tensor, parameters: bool) -> None:
         """
         :param grad: ``(n_members, batch, width)``
-        :param parameters: As in :meth:`Hidden.backward`
+        :param parameters: As in :meth:`Hidden.backward`; with one unit they cost nothing, and are written anyway
         """
         output_backward(array(grad)[..., 0], self._x, self._weights[0], *self._weight_grads, self._grad_x)
 

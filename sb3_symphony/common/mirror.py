@@ -67,7 +67,7 @@ class Reflection:
         :return: their mirror images
         """
         order = self.order.to(vectors.device)
-        return th.addcmul(self.offset.to(vectors), vectors[:, order], self.signs.to(vectors))
+        return th.addcmul(self.offset.to(vectors), vectors.index_select(1, order), self.signs.to(vectors))
 
 
 class Mirror:

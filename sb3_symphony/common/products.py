@@ -39,10 +39,16 @@ MOST_ALONE = 2**23  # multiplications of a product up to which one thread is eno
 
 def _tile(n_rows: int) -> Callable[..., None]:
     """
-    A function, for compiled loops, that computes ``n_rows × COLUMNS`` sums of a product, in registers from first to last.
+    A function, for compiled loops, that computes ``n_rows × COLUMNS`` sums of a product, in registers from first to last::
 
-    Its arguments are addresses and strides in numbers: the first factor's with the strides of its rows and columns, that
-    of packed columns ``(depth, COLUMNS)`` of the second one, the result's with the stride of its rows; and the depth.
+        for k in range(depth):
+            for i in range(n_rows):
+                for j in range(COLUMNS):
+                    sums[i, j] += a[i, k] * b[k, j]
+
+    It is written in LLVM's language, since a compiler given these loops keeps the sums in memory. Arguments are addresses,
+    and strides counted in numbers: of the first factor, and those of its rows and columns; of packed columns
+    ``(depth, COLUMNS)`` of the second one; of the result, and that of its rows; and the depth.
     """
 
     @intrinsic
