@@ -113,7 +113,7 @@ def test_which_products(monkeypatch, dtype, bfloat16, tiles, expected):
     assert type(products_of(operands_of(dtype=dtype), bfloat16)) is expected
 
 
-@pytest.mark.parametrize("threads, tiled", [(1, True), (2, False)])
+@pytest.mark.parametrize("threads, tiled", [(1, True), (2, True), (3, False)])
 def test_large_products_are_shared_by_threads(monkeypatch, threads, tiled):
     monkeypatch.setattr(products, "MOST_ALONE", 100)
     monkeypatch.setattr(th, "get_num_threads", lambda: threads)

@@ -267,8 +267,8 @@ class TiledProducts(Products):
             self._x_product()
 
     def _is_shared(self) -> bool:
-        """Whether several threads of torch's BLAS are to make it."""
-        return self._is_large and th.get_num_threads() > 1
+        """Whether the threads of torch's BLAS are to make it: alone, tiles are as fast as two of them."""
+        return self._is_large and th.get_num_threads() > 2
 
 
 class BFloat16Products(Products):
