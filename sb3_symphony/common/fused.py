@@ -95,12 +95,15 @@ class Layer:
 
     :param linear: The linear layer
     :param x: Where its input will be ``(n_members, batch, in_features)``
+    :param lender: A layer of the same shape, of another network, whose memory is used; what that has computed is lost then.
+        Critics and targets take turns, and what both keep for themselves does not fit a second-level cache
     """
 
-    def __init__(self, linear: StackedLinear, x: th.Tensor) -> None:
+    def __init__(self, linear: StackedLinear, x: th.Tensor, lender: "Layer | None" = None) -> None:
         self.weight = linear.weight.detach()
         self._n_members, _, width = self.weight.shape
-        self.out = self.weight.new_zeros(*x.shape[:2], width)  # (n_members, batch, width)
+        # The result (n_members, batch, width)
+        self.out: th.Tensor = self.weight.new_zeros(*x.shape[:2], width) if lender is None else lender.out
         self.parameters: list[nn.Parameter] = [linear.weight, linear.bias]
         self.grads = [th.zeros_like(parameter).detach() for parameter in self.parameters]
 
@@ -112,8 +115,6 @@ class Hidden(Layer):
     What is dropped is what the module drops with the same generator state.
 
     :param grad_x: Where the gradient with respect to the input is to be, if it is wanted
-    :param lender: A layer of the same shape, of another network, whose memory is used; what that has computed is lost then.
-        Critics and targets take turns, and what both keep for themselves does not fit a second-level cache
     """
 
     def __init__(
@@ -127,7 +128,7 @@ class Hidden(Layer):
         bfloat16: bool,
         lender: "Hidden | None" = None,
     ) -> None:
-        super().__init__(linear, x)
+        super().__init__(linear, x, lender)
         self.dropout, self.activation = dropout, activation
         if lender is None:
             self.grad = th.zeros_like(self.out)  # with respect to the result
@@ -137,7 +138,7 @@ class Hidden(Layer):
             self.rstd = self.out.new_zeros(self.out.shape[:2])
             self.derivative = th.zeros_like(self.out) if activation.code == LEAKY_SINE else self.out
         else:
-            self.out, self.grad, self.product = lender.out, lender.grad, lender.product
+            self.grad, self.product = lender.grad, lender.product
             self.rstd, self.derivative = lender.rstd, lender.derivative
         self.products = products_of(Operands(self.weight, x, self.product, self.grad, self.grads[0], grad_x), bfloat16)
         gain = shift = linear.bias  # in place of what the kernel does not use

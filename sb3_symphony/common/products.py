@@ -52,8 +52,8 @@ def _tile(n_rows: int) -> Callable[..., None]:
     """
 
     @intrinsic
-    def tile(typing_context, a, a_row, a_column, b, out, out_row, depth):  # type: ignore[no-untyped-def]
-        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+    def tile(typing_context, a, a_row, a_column, b, out, out_row, depth):
+        def generate(context, builder, signature, arguments):
             a, a_row, a_column, b, out, out_row, depth = arguments
             number, index, lane = ir.FloatType(), ir.IntType(64), ir.IntType(32)
             vector = ir.VectorType(number, LANES)
@@ -300,10 +300,11 @@ class BFloat16Products(Products):
     def backward(self, parameters: bool) -> None:
         weight, x, _, grad, grad_weight, grad_x = self._rounded  # the first two are still there from the forward pass
         grad.copy_(self._operands.grad)
+        to_grad_weight, to_grad_x = self._operands[4:]
         if parameters:
-            self._operands.grad_weight.copy_(th.bmm(x.transpose(1, 2), grad, out=grad_weight))
-        if self._operands.grad_x is not None and grad_x is not None:
-            self._operands.grad_x.copy_(th.bmm(grad, weight.transpose(1, 2), out=grad_x))
+            to_grad_weight.copy_(th.bmm(x.transpose(1, 2), grad, out=grad_weight))
+        if to_grad_x is not None:
+            to_grad_x.copy_(th.bmm(grad, weight.transpose(1, 2), out=grad_x))
 
 
 MIN_ROUNDED = 4096  # weights per member: below, the casts cost more than the products gain
