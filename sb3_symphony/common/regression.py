@@ -192,9 +192,10 @@ class FusedRegression(CriticRegression):
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
         # Network, addresses of the optimiser's state and of the targets, all of them in the sweeps
         self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])
-        # While nothing changes: the passes that were looked up (None: none), and whether the sweeps are theirs
+        # While nothing changes: whether there are passes, those that were looked up, and whether the sweeps are theirs
         self._unchanged = False
-        self._known: dict[tuple[EnsembleCritic, int], FusedNetwork | None] = {}
+        self._has_passes: bool | None = None
+        self._known: dict[tuple[EnsembleCritic, int], FusedNetwork] = {}
         self._sweeps_known = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -203,7 +204,7 @@ class FusedRegression(CriticRegression):
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        self._unchanged, self._known, self._sweeps_known = True, {}, False
+        self._unchanged, self._has_passes, self._known, self._sweeps_known = True, None, {}, False
         try:
             yield
         finally:
@@ -246,12 +247,15 @@ class FusedRegression(CriticRegression):
 
     def _passes(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork | None:
         """Hand-written passes of critics; ``None`` if something about them is autograd's business."""
+        if not self._unchanged or self._has_passes is None:
+            both = self.critic, self.critic_target
+            self._has_passes = not any(not_fusable(each) is not None or _has_more_than_passes(each) for each in both)
+            self._known = {}
+        if not self._has_passes:
+            return None
         key = critic, batch_size
-        if self._unchanged and key in self._known:
-            return self._known[key]
-        both = self.critic, self.critic_target
-        special = any(not_fusable(each) is not None or _has_more_than_passes(each) for each in both)
-        self._known[key] = None if special else self._network(critic, batch_size)
+        if key not in self._known:
+            self._known[key] = self._network(critic, batch_size)
         return self._known[key]
 
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
@@ -323,14 +327,14 @@ def not_fusable(critic: EnsembleCritic) -> str | None:
     :return: A reason, or ``None`` if they can
     """
     optimizer = _optimizer_of(critic)
-    if critic.device.type != "cpu":
-        return f"the device is {critic.device}, not the CPU"
     if type(critic) is not EnsembleCritic:  # a subclass may compute something else
         return f"the critic is {type(critic).__name__}, not EnsembleCritic"
     if type(critic.features_extractor) is not FlattenExtractor:
         return f"the features extractor is {type(critic.features_extractor).__name__}, not FlattenExtractor"
     if type(critic.q_networks) is not StackedMLP:
         return f"the networks are {type(critic.q_networks).__name__}, not StackedMLP"
+    if (device := parameters_of(critic.q_networks)[0].device).type != "cpu":  # by critic.device it takes ten times as long
+        return f"the device is {device}, not the CPU"
     if (layer := uncovered(critic.q_networks)) is not None:
         return f"no hand-written passes for {layer}"
     if optimizer is None:
