@@ -1,6 +1,7 @@
 """Callbacks, logged keys and their values, and what ends bootstrapping."""
 
 import copy
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium as gym
@@ -266,11 +267,19 @@ def test_training_may_be_stopped(make, pendulum):
     assert model.num_timesteps == 100
 
 
+@pytest.mark.parametrize("raises", [False, True])
 @pytest.mark.parametrize("n_steps, last", [(1, 47), (1, 50), (3, 47), (3, 50)])
-def test_learning_after_a_stop(make, n_steps, last):
+def test_learning_after_a_stop(make, n_steps, last, raises):
     """The step that the callback stopped at is not stored: what follows it is a new episode, not the same one's next step."""
     model = make(n_steps=n_steps, gamma=0.5, gradient_steps=0)  # episodes of 25 steps
-    model.learn(200, callback=lambda locals_, globals_: model.num_timesteps < last)
+
+    def stop(locals_, globals_):
+        if raises and model.num_timesteps == last:
+            raise KeyboardInterrupt
+        return model.num_timesteps < last
+
+    with pytest.raises(KeyboardInterrupt) if raises else nullcontext():
+        model.learn(200, callback=stop)
     model.learn(20, reset_num_timesteps=False)
     buffer = model.replay_buffer
     assert buffer.pos == last - 1 + 20

@@ -239,6 +239,29 @@ def test_a_callback_may_change_the_exponent_of_weights(tmp_path, small, pendulum
     assert model.replay_buffer.beta == 0.4 + 60 / 200
 
 
+@pytest.mark.parametrize("algorithm", [REDQ, SAC])
+def test_arguments_that_a_callback_has_changed(tmp_path, small, pendulum, algorithm):
+    class Faster(BaseCallback):
+        def _on_step(self):
+            if self.num_timesteps == 40:
+                self.model.gradient_steps = 3
+            return True
+
+    def learn(steps, checkpoint=None):
+        model = small(REDQ, pendulum()) if algorithm is REDQ else SAC("MlpPolicy", pendulum(), learning_starts=20, seed=0)
+        record_episodes(model.env)
+        exact = ExactCheckpoints(tmp_path, 60, checkpoint=checkpoint)
+        return model.learn(steps, callback=[Faster(), exact])
+
+    expected = learn(100)
+    learn(70)
+    resumed = learn(100, newest_checkpoint(tmp_path))
+    assert newest_checkpoint(tmp_path).state["arguments"] == {"gradient_steps": 3}
+    assert resumed.gradient_steps == expected.gradient_steps == 3
+    assert resumed._n_updates == expected._n_updates
+    assert difference(resumed.get_parameters(), expected.get_parameters()) is None
+
+
 def fresh(tmp_path, make, steps, at, capsys):
     """Resume where episodes cannot be replayed; returns the model."""
     model = make()

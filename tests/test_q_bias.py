@@ -8,7 +8,7 @@ from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_symphony import REDQ, DroQ, Symphony
@@ -182,6 +182,8 @@ def test_rewards_are_normalised_as_in_training():
     assert result.mean_return == pytest.approx(monte_carlo_returns(rewards, np.zeros(7), GAMMA).mean(), rel=1e-5)
     np.testing.assert_array_equal(before[0], train_env.ret_rms.var)
     np.testing.assert_array_equal(before[1], train_env.obs_rms.mean)
+    watched = VecMonitor(VecNormalize(DummyVecEnv([Chain])))  # one more wrapper than in training
+    assert q_bias(model, watched, n_pairs=7, max_episode_steps=7).mean_return == pytest.approx(result.mean_return)
     with pytest.raises(ValueError, match="expected VecNormalize around it"):
         q_bias(model, Chain())
     with pytest.raises(ValueError, match="expected none of VecNormalize"):

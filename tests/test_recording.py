@@ -86,6 +86,23 @@ def test_wrappers_have_their_counts_again():
     assert difference(other.step(np.array([0.5])), env.step(np.array([0.5]))) is None
 
 
+def test_a_monitor_that_refuses_early_resets():
+    def make():
+        return RecordedEpisode(Monitor(gym.make("Pendulum-v1"), allow_early_resets=False))
+
+    env, other = make(), make()
+    env.reset(seed=0)
+    env.step(np.array([1.0]))
+    other.reset(seed=5)
+    other.step(np.array([1.0]))
+    assert other.replay(env.recorded_state())
+    assert difference(other.step(np.array([0.5])), env.step(np.array([0.5]))) is None
+    other.start_anew(env.recorded_state())
+    other.reset()
+    with pytest.raises(RuntimeError, match="early"):
+        other.reset()
+
+
 class Arm(gym.Env):
     """Its state is a part of its own, and an array that it never replaces."""
 

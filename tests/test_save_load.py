@@ -1,6 +1,7 @@
 """What a saved model holds, and that training goes on from it as if nothing had happened."""
 
 import copy
+import inspect
 import io
 import json
 import random
@@ -312,6 +313,9 @@ def test_arguments_given_to_load(make, algorithm, tmp_path):
     )
     assert (loaded.gamma, loaded.gradient_steps, loaded.replay_buffer.buffer_size) == (0.5, 2, 7)
     loaded.learn(30)
+    for name, parameter in inspect.signature(model.policy_class).parameters.items():
+        if parameter.default is not parameter.empty and name not in model.policy_kwargs:
+            algorithm.load(tmp_path / "model", policy_kwargs={name: parameter.default})
     with pytest.raises(ValueError, match=r"policy_kwargs has net_arch=\[32\]: the saved model has \[16\]"):
         algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[32]))
 

@@ -296,7 +296,7 @@ class FadingReplayBuffer(FadedSampling, _StepsReplayBuffer):
         stored = self.n_starts - self.oldest_start
         if uniform or stored == 0:
             return super().sample(batch_size, env, uniform)
-        rows = self._draw_rows(batch_size, uniform)
+        rows = self._draw_rows(batch_size, uniform=False)
         env_indices = np.random.randint(0, self.n_envs, size=batch_size)
         chosen = np.random.random(batch_size) < self.start_share
         ages = draw_faded_ages(stored, int(chosen.sum()), self.fade_factor, self.fade_power)

@@ -13,6 +13,7 @@ A checkpoint holds pickled objects: resume only runs of people you trust.
 
 import inspect
 import os
+import pickle
 import re
 import time
 from collections import Counter, deque
@@ -60,8 +61,18 @@ def _attributes(instance: Any) -> dict[str, Any]:
     What an algorithm or a callback counts and collects: attributes of plain values that are no arguments of its
     constructor, since these are settings. Networks, schedules and the like are none of them.
     """
-    settings = {name for base in type(instance).__mro__ for name in inspect.signature(base).parameters if base is not object}
-    return {k: v for k, v in vars(instance).items() if k not in settings and k not in _NOT_STATE and _is_plain(v)}
+    left_out = _argument_names(instance) | _NOT_STATE
+    return {name: value for name, value in vars(instance).items() if name not in left_out and _is_plain(value)}
+
+
+def _arguments(instance: Any) -> dict[str, Any]:
+    """Those of its constructor that are plain values, as they are now."""
+    names = _argument_names(instance)
+    return {name: value for name, value in vars(instance).items() if name in names and _is_plain(value)}
+
+
+def _argument_names(instance: Any) -> set[str]:
+    return {name for base in type(instance).__mro__ for name in inspect.signature(base).parameters if base is not object}
 
 
 def _gsde_distributions(model: BaseAlgorithm) -> list[StateDependentNoiseDistribution]:
@@ -270,6 +281,7 @@ class ExactCheckpoints(BaseCallback):
         self.segments = ReplaySegments(self.folder, [] if checkpoint is None else checkpoint.state["segments"])
         self._segments_of: dict[int, set[str]] = {}  # steps of a checkpoint -> files that it needs
         self._restoring = checkpoint
+        self._arguments: dict[str, bytes] = {}  # of the algorithm, as it was built
 
     @property
     def restored(self) -> bool:
@@ -277,6 +289,7 @@ class ExactCheckpoints(BaseCallback):
         return self._restoring is None
 
     def _init_callback(self) -> None:
+        self._arguments = self._arguments or {name: pickle.dumps(value) for name, value in _arguments(self.model).items()}
         if self._restoring is not None:
             return
         self._latest = min(self._latest, self.model.num_timesteps)  # whose count may have restarted
@@ -320,6 +333,9 @@ class ExactCheckpoints(BaseCallback):
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             state = training_state(model)
+            # A resumed run is built with the same arguments, so only what a callback has made of them is to be kept
+            arguments = _arguments(model).items()
+            state["arguments"] = {k: value for k, value in arguments if pickle.dumps(value) != self._arguments.get(k)}
             state["rollout follows"] = rollout_follows
             state["folder"] = os.path.abspath(self.folder)
             log_folder = model.logger.get_dir()
@@ -374,6 +390,7 @@ class ExactCheckpoints(BaseCallback):
             if self._buffer is not None:
                 restore_buffer(self._buffer, state["buffer"], self.segments)
             restore_training_state(model, state)
+        vars(model).update(state.get("arguments", {}))
         for key, callback in self._named_callbacks():
             vars(callback).update(state["callbacks"].get(key, {}))
 

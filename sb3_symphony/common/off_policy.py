@@ -294,10 +294,14 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         super()._store_transition(replay_buffer, *args, **kwargs)
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        rollout = super().collect_rollouts(*args, **kwargs)
-        if not rollout.continue_training:
-            # The environments are a step ahead of the latest observation, maybe in another episode: the next learn() resets
-            self._last_obs = None
+        continues = False
+        try:
+            rollout = super().collect_rollouts(*args, **kwargs)
+            continues = rollout.continue_training
+        finally:
+            if not continues:  # a callback has stopped it, or something was raised
+                # Environments are a step ahead of the latest observation, maybe in another episode: the next learn() resets
+                self._last_obs = None
         return rollout
 
     def _segments(
@@ -495,10 +499,15 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         if "stats_window_size" in kwargs:
             kwargs["_stats_window_size"] = kwargs.pop("stats_window_size")
         model = super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        defaults = constructor_parameters(model.policy_class)
         for name, value in policy_kwargs.items():
-            saved = model.policy_kwargs.get(name, getattr(model.policy, name, None))
-            if _without_tuples(value) != _without_tuples(saved):  # SB3 saves them as JSON
-                raise ValueError(f"policy_kwargs has {name}={value!r}: the saved model has {saved!r}")
+            if name in model.policy_kwargs:
+                saved = [model.policy_kwargs[name]]
+            else:  # the default, or what the policy has made of it
+                default = defaults[name].default if name in defaults else None
+                saved = [default, getattr(model.policy, name, default)]
+            if _without_tuples(value) not in map(_without_tuples, saved):  # SB3 saves them as JSON
+                raise ValueError(f"policy_kwargs has {name}={value!r}: the saved model has {saved[-1]!r}")
         if "_stats_window_size" in kwargs:
             model.ep_info_buffer = deque(model.ep_info_buffer or (), model._stats_window_size)
             model.ep_success_buffer = deque(model.ep_success_buffer or (), model._stats_window_size)

@@ -12,7 +12,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import check_for_correct_spaces, set_random_seed
-from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_symphony.common.checks import check_number
 from sb3_symphony.common.ensembles import EnsembleCritic
@@ -138,7 +138,9 @@ def _prepared(env: gym.Env | VecEnv, model: OffPolicyAlgorithm) -> VecEnv:
         need = "VecNormalize around it, as around the training environment" if own is None else "none of VecNormalize"
         raise ValueError(f"env: expected {need}")
     if learned is not None and own is not None:
-        sync_envs_normalization(model.env, vec_env)  # type: ignore[arg-type]  # set, since there is a normalisation
+        for name in ("obs_rms", "ret_rms"):
+            if hasattr(learned, name):  # not without normalisation
+                setattr(own, name, copy.deepcopy(getattr(learned, name)))
         own.training, own.norm_obs, own.norm_reward = False, learned.norm_obs, learned.norm_reward
     return vec_env
 

@@ -121,6 +121,7 @@ class RecordedEpisode(gym.Wrapper):
         try:
             self._set_wrappers(start["wrappers"])
             self._set_generators(start["generators"])
+            self.monitor.needs_reset = True  # it may be told to refuse resets in the middle of an episode
             self.reset(seed=start["seed"], options=start["options"])
             if not _same_bits(self.observation, start["observation"]):
                 return False
@@ -146,6 +147,7 @@ class RecordedEpisode(gym.Wrapper):
         self._set_wrappers(state["wrappers"])
         self._set_generators(state["generators"])
         self._set_monitor(state)
+        self.monitor.needs_reset = True  # as in replay()
 
     @property
     def monitor(self) -> Monitor:

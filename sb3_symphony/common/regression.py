@@ -180,7 +180,8 @@ class FusedRegression(CriticRegression):
     """
     The same by hand-written passes in memory kept between calls, Adam and Polyak in one sweep.
 
-    :param bfloat16: Whether to round the operands of large products, see :class:`~sb3_symphony.common.fused.BFloat16Products`
+    :param bfloat16: Whether to round the operands of large products, see
+        :class:`~sb3_symphony.common.products.BFloat16Products`
     """
 
     def __init__(

@@ -321,7 +321,7 @@ class EpisodeStepLimit(gym.Wrapper):
     Cuts episodes at ``max_steps`` as long as fewer than ``until_total_steps`` steps were taken in all (a warm-up cut).
 
     A cut is a truncation, as by Gymnasium's ``TimeLimit``: SB3 bootstraps through it. For training only. With parallel
-    environments each counts its own steps. ``total_steps`` may be set when training is resumed.
+    environments each counts its own steps.
 
     If a ``Monitor`` is already there, the limit goes beneath it, so that cut episodes are reported like any other.
 
@@ -348,13 +348,6 @@ class EpisodeStepLimit(gym.Wrapper):
     def total_steps(self) -> int:
         """Steps taken in all, over all episodes."""
         return self._total_steps if self._inner is None else self._inner.total_steps
-
-    @total_steps.setter
-    def total_steps(self, value: int) -> None:
-        if self._inner is None:
-            self._total_steps = value
-        else:
-            self._inner.total_steps = value
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """

@@ -74,8 +74,9 @@ class Symphony(EnsembleOffPolicyAlgorithm):
     :param actor_loss: Objective of the actor: ``"rehae"``, ``"rehae_elementwise"`` or ``"mean"`` (that of TD3)
     :param initial_gradient_steps: Updates made once when learning starts: with uniform sampling, then with faded
     :param episode_gradient_steps: Additional updates at the start of each episode
-    :param warmup_policy: Who acts before learning starts: ``"actor"``, with weights drawn anew for each episode as long as
-        they are not trained or given, or ``"uniform"`` random actions
+    :param warmup_policy: Who acts before learning starts: ``"actor"``, with weights drawn anew for each episode (of several
+        environments: whenever one of them ends) as long as they are neither trained nor loaded, or ``"uniform"`` random
+        actions
     :param stats_window_size: Number of episodes to average the reported success rate, length and reward over
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
     :param policy_kwargs: Arguments of the policy, see :class:`~sb3_symphony.symphony.policies.SymphonyPolicy`
