@@ -108,6 +108,17 @@ def test_nulls_of_a_power_cut(tmp_path):
         read_episodes(tmp_path)
 
 
+def test_rows_that_are_cut(tmp_path):
+    """The last one may be: a process was killed while it wrote. One in between would shift the steps of all that follow."""
+    write_monitor(tmp_path / "0.monitor.csv", 0.0, [(1.0, 10, 1.0), (2.0, 20, 2.0)])
+    text = (tmp_path / "0.monitor.csv").read_text()
+    (tmp_path / "0.monitor.csv").write_text(text + "-3.1")
+    assert read_episodes(tmp_path).steps.tolist() == [10, 30]
+    (tmp_path / "0.monitor.csv").write_text(text + "-3.1\n4.0,40,4.0\n")
+    with pytest.raises(Damaged, match=r"0\.monitor\.csv: .*line 5: expected numbers r,l,t"):
+        read_episodes(tmp_path)
+
+
 def test_damaged_files(tmp_path):
     (tmp_path / "0.monitor.csv").write_text("r,l,t\n1,2,3\n")
     with pytest.raises(ValueError, match=r"0\.monitor\.csv: not a monitor file"):

@@ -193,6 +193,10 @@ def test_mean_per_ten_episodes(logs, figures):
     np.testing.assert_allclose(bold, [[10, 20, 30], [4.5, 14.5, 24.5]])
     assert not faint and figures[0].axes[0].get_xlabel() == "training episodes"
     assert (logs / "td3" / "X-v0_1" / "episodes.png").exists()
+    for letter in "ABC":
+        make_run(logs, "td3", f"{letter}-v0", 1, np.arange(10.0))
+    assert main(["plot"]) == 0
+    assert (logs / "5_environments_episodes.png").exists()  # not all of their names, which a file cannot have
 
 
 @pytest.mark.parametrize("seconds, unit, last", [(0.1, "seconds", "3"), (20.0, "minutes", "10"), (3600.0, "hours", "30")])

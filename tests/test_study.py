@@ -218,6 +218,17 @@ def test_sweeps_conditions_and_figures(write, tmp_path):
     assert read_study(write(sweeps={})).sweeps == {}
 
 
+def test_environment_of_a_sweep(write, tmp_path):
+    sweep = {"algo": "td3", "n_trials": 3}
+    study = read_study(write(sweeps={"s": sweep}, environments=["Pendulum-v1"]))
+    assert sweep_options(study, "s", tmp_path, tmp_path / "results").env == "Pendulum-v1"
+    both = ["Pendulum-v1", "BipedalWalker-v3"]
+    study = read_study(write(sweeps={"s": {**sweep, "env": "BipedalWalker-v3"}}, environments=both))
+    assert sweep_options(study, "s", tmp_path, tmp_path / "results").env == "BipedalWalker-v3"
+    with pytest.raises(ConfigError, match="sweeps: s: env: missing — expected one environment, such as Pendulum-v1"):
+        read_study(write(sweeps={"s": sweep}, environments=both))
+
+
 def test_sweep_of_an_own_algorithm(write, tmp_path, monkeypatch):
     """In a file beside the study, wherever the command is typed."""
     (tmp_path / "own.py").write_text("from stable_baselines3 import TD3\n\n\nclass Own(TD3):\n    pass\n")
@@ -280,7 +291,7 @@ def test_algorithms_of_a_file(write, tmp_path):
         ({"sweeps": {"x/y": {"algo": "td3"}}}, "sweeps: 'x/y' — expected letters, digits and . _ + -"),
         ({"sweeps": {"S": {"algo": "td3"}, "s": {"algo": "td3"}}}, "sweeps: names: 's' is there 2 times"),
         (
-            {"algorithms": [{"name": "a", "algo": "sac", "sweep": "s"}], "sweeps": {"s": {"algo": "td3"}}},
+            {"algorithms": [{"name": "a", "algo": "sac", "sweep": "s"}], "sweeps": {"s": {"algo": "td3", "env": WALKER}}},
             "algorithms: a: sweep: s is of algorithm 'td3' — expected 'sac'",
         ),
         ({"matrix": {"label": "x", "conditions": {1: {}, "1": {}}}}, "matrix: conditions: names: '1' is there 2 times"),

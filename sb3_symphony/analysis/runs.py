@@ -125,13 +125,16 @@ def _monitor_file(path: Path) -> Iterator[tuple[dict[str, Any], Iterator[str]]]:
 
 
 def _monitor_rows(rows: csv.DictReader, start: float) -> Iterator[tuple[float, float, int, float]]:
-    before, pause = 0.0, 0.0
+    before, pause, damaged = 0.0, 0.0, None
     for row in rows:
+        if damaged is not None:  # steps are counted by all lengths, so only the last row may be cut
+            raise ValueError(f"line {damaged}: expected numbers r,l,t")
         try:
             seconds, result = float(row["t"]), (float(row["r"]), int(row["l"]))
             told = row.get("is_success") or "nan"
             success = float({"True": 1, "False": 0}.get(told, told))
         except (TypeError, ValueError):
+            damaged = rows.line_num + 1  # below the header
             continue
         if seconds < before:  # a resumed run counts from zero again
             pause += before

@@ -162,7 +162,8 @@ def _default_output(options: PlotOptions, groups: "list[Group]") -> Path:
     """One run's figure lies in its folder, those of several beside each other."""
     if len(groups) == 1 and len(groups[0].runs) == 1:
         return groups[0].runs[0].path / f"{options.kind}.png"
-    names = "_".join(dict.fromkeys(RunFolder.file_name(group.env) for group in groups))
+    environments = list(dict.fromkeys(RunFolder.file_name(group.env) for group in groups))
+    names = "_".join(environments) if len(environments) <= 4 else f"{len(environments)}_environments"
     return Path("" if options.runs else options.folder) / f"{names}_{options.kind}.png"
 
 

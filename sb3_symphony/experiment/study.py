@@ -441,6 +441,8 @@ def _check(study: Study, folder: Path) -> None:
             sweep = sweep_options(study, name, folder, folder)
             load_config(sweep.training(sweep.hyperparams))
             read_space(sweep)
+            if "env" not in study.sweeps[name].model_fields_set and len(study.environments) > 1:
+                raise ConfigError(f"env: missing — expected one environment, such as {study.environments[0].id}")
         except ConfigError as error:
             raise ConfigError(f"sweeps: {name}: {error}") from None
     _check_twice("algorithms", [algorithm.name.lower() for algorithm in study.algorithms])  # folders, on any disk
@@ -627,6 +629,8 @@ def sweep_options(study: Study, name: str, folder: Path, results: Path) -> TuneO
     settled = {"log_folder": str(results / "sweeps"), "study_name": name, "device": study.device, "num_threads": 1}
     sweep = study.sweeps[name]
     space = None if sweep.space is None else str(folder / sweep.space)
+    if "env" not in sweep.model_fields_set:
+        settled["env"] = study.environments[0].id  # the only one
     own = {"algo": _whole(sweep.algo, folder), "conf_file": _conf(sweep.conf_file, folder), "space": space}
     return sweep.model_copy(update={**settled, **own})
 
