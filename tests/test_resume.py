@@ -345,6 +345,13 @@ def test_killed_before_the_first_checkpoint(killed, capsys):
 # ----------------------------------------------------------------------------------------------------------------------
 
 
+def test_time_after_training_is_not_training(monkeypatch):
+    monkeypatch.setattr("sb3_symphony.experiment.train._save_model", lambda *args: time.sleep(1))
+    result = train(options(log_folder="a"))
+    elapsed = newest_checkpoint(result.run.checkpoints).state["elapsed"] / 1e9
+    assert result.seconds <= elapsed < result.seconds + 0.5  # what a longer run goes on from
+
+
 @pytest.mark.parametrize("save_freq", [-1, 100])
 def test_finished_run_is_left_alone(capsys, save_freq):
     run = train(options(save_freq=save_freq)).run.path

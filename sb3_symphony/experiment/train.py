@@ -444,13 +444,15 @@ def _train(
                 model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:
             stop.requested = True
-        seconds = (time.time_ns() - (model.start_time or time.time_ns())) / 1e9
+        ended = time.time_ns()
+        seconds = (ended - (model.start_time or ended)) / 1e9
         if options.progress:
             bar.close()
         finished = checkpoints is not None and checkpoints.finished
         if checkpoints is None or checkpoints.restored:
             _save_model(model, run)
         if checkpoints is not None and finished:
+            model.start_time += time.time_ns() - ended  # saving and drawing are no part of the training that may go on
             checkpoints.save(rollout_follows=False)
     results = evaluation.evaluations_results if evaluation is not None else []
     last = [float(value) for value in results[-1]] if results else []
