@@ -334,7 +334,7 @@ def not_fusable(critic: EnsembleCritic) -> str | None:
         return f"the features extractor is {type(critic.features_extractor).__name__}, not FlattenExtractor"
     if type(critic.q_networks) is not StackedMLP:
         return f"the networks are {type(critic.q_networks).__name__}, not StackedMLP"
-    if (device := parameters_of(critic.q_networks)[0].device).type != "cpu":  # by critic.device it takes ten times as long
+    if (device := parameters_of(critic.q_networks)[0].device).type != "cpu":  # critic.device looks through all modules
         return f"the device is {device}, not the CPU"
     if (layer := uncovered(critic.q_networks)) is not None:
         return f"no hand-written passes for {layer}"
