@@ -56,23 +56,16 @@ def _is_plain(value: Any) -> bool:
     return isinstance(value, _PLAIN)
 
 
-def _attributes(instance: Any) -> dict[str, Any]:
+def _attributes(instance: Any, arguments: bool = False) -> dict[str, Any]:
     """
     What an algorithm or a callback counts and collects: attributes of plain values that are no arguments of its
     constructor, since these are settings. Networks, schedules and the like are none of them.
+
+    :param arguments: the settings instead, as they are now
     """
-    left_out = _argument_names(instance) | _NOT_STATE
-    return {name: value for name, value in vars(instance).items() if name not in left_out and _is_plain(value)}
-
-
-def _arguments(instance: Any) -> dict[str, Any]:
-    """Those of its constructor that are plain values, as they are now."""
-    names = _argument_names(instance)
-    return {name: value for name, value in vars(instance).items() if name in names and _is_plain(value)}
-
-
-def _argument_names(instance: Any) -> set[str]:
-    return {name for base in type(instance).__mro__ for name in inspect.signature(base).parameters if base is not object}
+    settings = {name for base in type(instance).__mro__ for name in inspect.signature(base).parameters if base is not object}
+    found = {name: value for name, value in vars(instance).items() if (name in settings) == arguments and _is_plain(value)}
+    return {name: value for name, value in found.items() if name not in _NOT_STATE}
 
 
 def _gsde_distributions(model: BaseAlgorithm) -> list[StateDependentNoiseDistribution]:
@@ -289,7 +282,8 @@ class ExactCheckpoints(BaseCallback):
         return self._restoring is None
 
     def _init_callback(self) -> None:
-        self._arguments = self._arguments or {name: pickle.dumps(value) for name, value in _arguments(self.model).items()}
+        arguments = _attributes(self.model, arguments=True).items()
+        self._arguments = self._arguments or {name: pickle.dumps(value) for name, value in arguments}
         if self._restoring is not None:
             return
         self._latest = min(self._latest, self.model.num_timesteps)  # whose count may have restarted
@@ -334,7 +328,7 @@ class ExactCheckpoints(BaseCallback):
             self.folder.mkdir(parents=True, exist_ok=True)
             state = training_state(model)
             # A resumed run is built with the same arguments, so only what a callback has made of them is to be kept
-            arguments = _arguments(model).items()
+            arguments = _attributes(model, arguments=True).items()
             state["arguments"] = {k: value for k, value in arguments if pickle.dumps(value) != self._arguments.get(k)}
             state["rollout follows"] = rollout_follows
             state["folder"] = os.path.abspath(self.folder)

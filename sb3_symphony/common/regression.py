@@ -193,23 +193,22 @@ class FusedRegression(CriticRegression):
         self._sweeps: list[partial] = []  # of Adam and Polyak, one per parameter
         # Network, addresses of the optimiser's state and of the targets, all of them in the sweeps
         self._swept: tuple[FusedNetwork | None, list[int]] = (None, [])
-        # While nothing changes: whether there are passes, those that were looked up, and whether the sweeps are theirs
-        self._unchanged = False
+        # While nothing changes: whether there are passes (None: it may change), those looked up, whether the sweeps are theirs
         self._has_passes: bool | None = None
         self._known: dict[tuple[EnsembleCritic, int], FusedNetwork] = {}
         self._sweeps_known = False
 
     def __getstate__(self) -> dict[str, Any]:
         made_again: dict[str, Any] = {"_networks": {}, "_sweeps": [], "_swept": (None, []), "_known": {}}
-        return {**vars(self), **made_again, "_unchanged": False}
+        return {**vars(self), **made_again, "_has_passes": None}
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        self._unchanged, self._has_passes, self._known, self._sweeps_known = True, None, {}, False
+        self._has_passes, self._known, self._sweeps_known = self._are_fusable(), {}, False
         try:
             yield
         finally:
-            self._unchanged = False
+            self._has_passes = None
 
     def fit(
         self,
@@ -248,16 +247,18 @@ class FusedRegression(CriticRegression):
 
     def _passes(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork | None:
         """Hand-written passes of critics; ``None`` if something about them is autograd's business."""
-        if not self._unchanged or self._has_passes is None:
-            both = self.critic, self.critic_target
-            self._has_passes = not any(not_fusable(each) is not None or _has_more_than_passes(each) for each in both)
-            self._known = {}
+        if self._has_passes is None:
+            return self._network(critic, batch_size) if self._are_fusable() else None
         if not self._has_passes:
             return None
         key = critic, batch_size
         if key not in self._known:
             self._known[key] = self._network(critic, batch_size)
         return self._known[key]
+
+    def _are_fusable(self) -> bool:
+        both = self.critic, self.critic_target
+        return not any(not_fusable(each) is not None or _has_more_than_passes(each) for each in both)
 
     def _network(self, critic: EnsembleCritic, batch_size: int) -> FusedNetwork:
         known = self._networks.get(critic, [])
@@ -272,7 +273,7 @@ class FusedRegression(CriticRegression):
 
     def _step(self, network: FusedNetwork, tau: float) -> None:
         """Adam and Polyak of all parameters."""
-        if not (self._unchanged and self._sweeps_known and network is self._swept[0]):
+        if self._has_passes is None or not self._sweeps_known or network is not self._swept[0]:
             self._prepare_sweeps(network)
             self._sweeps_known = True
         group = self.critic.optimizer.param_groups[0]

@@ -105,6 +105,7 @@ class SymphonyPolicy(EnsemblePolicy, TD3Policy):
         this part of its updates so far (0.125: the last eighth); training is the same without, but for ``GreedyEpisodes``
     """
 
+    # Other classes than SB3's annotations
     actor: Actor
     critic: EnsembleCritic  # type: ignore[assignment]
     critic_target: EnsembleCritic  # type: ignore[assignment]
