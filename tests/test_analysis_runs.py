@@ -283,6 +283,19 @@ def test_groups_of_rl_zoo_are_told_apart_too(tmp_path):
     assert [len(group.runs) for group in group_runs(runs)] == [1, 1]
 
 
+def test_arguments_of_the_environment_in_rl_zoo(tmp_path):
+    for number, gravity in enumerate((9.0, 5.0, 9.0, None), 1):
+        path = make_run(tmp_path, number=number, gamma=0.9)
+        arguments = {"algo": "sac", "env": "X-v0", "seed": number, "env_kwargs": gravity and {"g": gravity}}
+        (path / "X-v0" / "args.yml").write_text(yaml.safe_dump(arguments))
+    groups = group_runs(find_runs(tmp_path))
+    assert [(group.label, len(group.runs)) for group in groups] == [
+        ("sac env_kwargs {'g': 9.0}", 2),
+        ("sac env_kwargs {'g': 5.0}", 1),
+        ("sac env_kwargs default", 1),
+    ]
+
+
 def test_groups_are_told_apart_by_what_differs(tmp_path):
     paths = [
         make_run(tmp_path, number=1, gamma=0.9, policy_kwargs={"net_arch": [64], "n_critics": 2}),

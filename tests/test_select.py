@@ -3,6 +3,7 @@
 import pytest
 import yaml
 
+from sb3_symphony.cli import main
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.select import SelectOptions, select_model
 
@@ -191,6 +192,24 @@ def test_run_of_rl_zoo(folder):
     assert found.settings.frame_stack == 3 and found.settings.env_kwargs == {"g": 9.0}
     assert found.settings.normalize == {"norm_obs": True, "norm_reward": False} and found.normalization is not None
     assert select(model=str(run)).algo == "ppo"
+    assert select(model=str(run), env_kwargs={"g": 5.0}).settings.env_kwargs == {"g": 5.0}
+
+
+def test_configuration_of_a_run_of_rl_zoo(folder, capsys):
+    run = make_run(folder / "logs", algo="ppo")
+    (run / "Pendulum-v1" / "config.yml").write_text(ZOO_CONFIG)
+    (run / "Pendulum-v1" / "args.yml").write_text(ZOO_ARGUMENTS)
+    argv = ["train", "-conf", str(run / "Pendulum-v1" / "config.yml"), "--dry-run"]
+    pixels = {"render_mode": "rgb_array"}
+    for flags, expected in (([], {"g": 9.0}), (["--env-kwargs", "render_mode:rgb_array"], {"g": 9.0, **pixels})):
+        assert main([*argv, *flags]) == 0
+        out = capsys.readouterr().out
+        assert out.startswith("# ppo on Pendulum-v1, ") and yaml.safe_load(out)["env_kwargs"] == expected
+    expression = "dict(g=8.0, render_mode='rgb_array')"
+    (run / "Pendulum-v1" / "config.yml").write_text(f'{ZOO_CONFIG}  - - env_kwargs\n    - "{expression}"\n')
+    assert main(argv) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["env_kwargs"] == {"g": 9.0, **pixels}
+    assert select(model=str(run), vecnormalize="none").settings.env_kwargs == {"g": 9.0, **pixels}
 
 
 def test_pretrained_agents(folder, capsys):

@@ -419,6 +419,30 @@ def test_show(played, options, tmp_path, capsys):
     assert len(played.started) == 5
 
 
+def test_results_of_a_study_in_another_storage_are_kept(played, options, tmp_path, capsys):
+    folder = tune(options()).folder
+    kept = {path.name: path.read_bytes() for path in folder.iterdir()}
+    message = r"--study-name: 'ppo-Line-v0' — expected another one, or another --log-folder: '.*' holds the results"
+    with pytest.raises(ConfigError, match=message):
+        tune(options(storage="other.log"))  # before a study is made there
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == kept
+    assert len(played.started) == 5 and not (tmp_path / "other.log").read_bytes()
+
+    elsewhere = {"storage": "other.log", "log_folder": "elsewhere"}
+    tune(options(**elsewhere))
+    for change in ({"show": True}, {"n_trials": 9}):
+        with pytest.raises(ConfigError, match=message):
+            tune(options(storage="other.log", **change))
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == kept
+    assert len(played.started) == 10
+
+    assert "7 trials (7 completed)" in tune(options(n_trials=7)).summary  # each goes on where it was
+    assert "6 trials (6 completed)" in tune(options(n_trials=6, **elsewhere)).summary
+    (folder / "trials.csv").write_bytes(b"\xff")
+    with pytest.raises(ConfigError, match=r"trials.csv': no table of trials — UnicodeDecodeError"):
+        tune(options(n_trials=8))
+
+
 def test_trials_that_run_are_shown(played, options):
     tune(options())
     storage = open_storage(options().where, lambda: None, 1)

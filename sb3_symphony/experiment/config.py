@@ -424,7 +424,7 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
         return f"{path.name}, {name}" if options.conf_file is None else f"-conf {path}, {name}", content[name]
     if has_entries(content):
         raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
-    return f"-conf {path}", content
+    return f"-conf {path}", with_env_kwargs(content, _arguments_of_run(path))
 
 
 def whose(conf_file: str | None) -> dict[str, str]:
@@ -432,11 +432,26 @@ def whose(conf_file: str | None) -> dict[str, str]:
     :param conf_file: value of ``-conf``
     :return: ``algo`` and ``env`` of the run whose ``config.yml`` that is, which does not hold them; of other files, nothing
     """
-    path = Path(conf_file or "")
-    options = path.parent / "args.yml"
-    if path.name != "config.yml" or not options.is_file():
-        return {}
-    return {name: value for name, value in read_yaml(options).items() if name in ("algo", "env")}
+    return {name: value for name, value in _arguments_of_run(Path(conf_file or "")).items() if name in ("algo", "env")}
+
+
+def _arguments_of_run(config: Path) -> dict[str, Any]:
+    path = config.parent / "args.yml"
+    return read_yaml(path) if config.name == "config.yml" and path.is_file() else {}
+
+
+def with_env_kwargs(config: dict[str, Any], arguments: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param config: content of a run's ``config.yml``
+    :param arguments: content of its ``args.yml``, where alone RL Zoo keeps the arguments of the environment
+    :return: the configuration with these
+    """
+    given = arguments.get("env_kwargs")
+    if not given:
+        return config
+    config = dict(config)
+    _read_expressions(config)
+    return {**config, "env_kwargs": {**(config.get("env_kwargs") or {}), **given}}
 
 
 def _override(plain: dict[str, Any], key: str, value: Any) -> None:

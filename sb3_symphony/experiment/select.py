@@ -22,6 +22,7 @@ from sb3_symphony.experiment.config import (
     read_yaml,
     run_settings,
     shipped_folder,
+    with_env_kwargs,
 )
 from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder, without_module
 from sb3_symphony.experiment.run_folder import RunFolder, is_zoo_run, steps_in_name
@@ -192,13 +193,10 @@ def _selection(options: SelectOptions, model: Path, run: RunFolder | None) -> Se
     if env_id is None:
         raise ConfigError(f"--env: missing — expected the environment that {model} is to act in")
 
-    config = read_yaml(run.details / "config.yml") if run else {}
-    # RL Zoo keeps the arguments of the environment with the command line's
-    env_kwargs = {**(config.get("env_kwargs") or {}), **(trained.get("env_kwargs") or {})}
+    config = with_env_kwargs(read_yaml(run.details / "config.yml") if run else {}, trained)
     if without_module(env_id) != without_module(trained.get("env", env_id)):
-        env_kwargs = {}  # of another environment
-    settings = run_settings({"n_timesteps": 1, **config, "env_kwargs": env_kwargs})
-    settings = settings.varied(options.env_kwargs, options.env_wrapper)
+        config["env_kwargs"] = {}  # of another environment
+    settings = run_settings({"n_timesteps": 1, **config}).varied(options.env_kwargs, options.env_wrapper)
     normalization = _normalization(options, model, run, settings, all_in_one=is_zoo_run(trained))
     known = run is not None or options.vecnormalize is not None
     return Selection(str(algo), model, str(env_id), settings, normalization, run.path if run else None, known)

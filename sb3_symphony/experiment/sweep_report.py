@@ -75,6 +75,32 @@ def parameters_of(trial: FrozenTrial | optuna.Trial) -> dict[str, str]:
     return {k: f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in trial.params.items()}
 
 
+def check_results(folder: Path, name: str, trials: list[FrozenTrial]) -> None:
+    """
+    See whether the results in a folder are those of a study, as another storage may have one of the same name. Studies are
+    told apart by when their first trial began.
+
+    :param folder: where results are written
+    :param name: name of the study
+    :param trials: all its trials
+    :raises ConfigError: if they are those of another study, or cannot be read
+    """
+    path = folder / "trials.csv"
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, csv.Error) as error:
+        raise ConfigError(f"'{path}': no table of trials — {told(error)}") from None
+    began = [str(trial.datetime_start or "") for trial in trials[:1]]
+    if [row.get("started") for row in rows[:1]] != began:
+        raise ConfigError(
+            f"--study-name: '{name}' — expected another one, or another --log-folder: '{folder}' holds the results of a study "
+            "of this name in another storage"
+        )
+
+
 class SweepReport:
     """
     Results of a study, as they are at the moment of each call.
@@ -124,8 +150,9 @@ class SweepReport:
         """
         Write ``plan.json``, ``trials.csv``, ``best.yml`` if a trial has completed, and figures if two have.
 
-        :raises ConfigError: if they cannot be written
+        :raises ConfigError: if they cannot be written, or the folder holds the results of another study
         """
+        check_results(self.folder, self.study.study_name, self.study.get_trials(deepcopy=False))
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_atomically(self.folder / "plan.json", json.dumps(self.plan, indent=1).encode())

@@ -33,7 +33,17 @@ from sb3_symphony.experiment.config import ConfigError, check_algorithm, load_co
 from sb3_symphony.experiment.output import check_folder, output_folder
 from sb3_symphony.experiment.registry import without_folder
 from sb3_symphony.experiment.space import SearchSpace, TuneOptions, read_space
-from sb3_symphony.experiment.sweep_report import ENDED, PLAN, REASON, RETURNS, SweepReport, best_of, parameters_of, replaced
+from sb3_symphony.experiment.sweep_report import (
+    ENDED,
+    PLAN,
+    REASON,
+    RETURNS,
+    SweepReport,
+    best_of,
+    check_results,
+    parameters_of,
+    replaced,
+)
 from sb3_symphony.experiment.sweep_storage import WORKER, StorageAway, SweepStorage, open_storage
 from sb3_symphony.experiment.train import build_model
 from sb3_symphony.experiment.trial import TrialFailed, TrialProcesses, evaluation_frequency, ignore_mini_batches
@@ -505,7 +515,9 @@ def _open_study(plan: Plan, storage: SweepStorage) -> optuna.Study:
     with storage.locked():
         if options.name in optuna.get_all_study_names(storage.optuna):
             study = optuna.load_study(study_name=options.name, storage=storage.optuna)
+            check_results(options.folder, options.name, study.get_trials(deepcopy=False))
         else:
+            check_results(options.folder, options.name, [])
             output_folder(options.folder, "--log-folder")
             study = optuna.create_study(study_name=options.name, storage=storage.optuna, direction="maximize")
         trials = study.get_trials(deepcopy=False)
