@@ -54,6 +54,13 @@ def test_whole_numbers_as_actions(make):
         make(env)
 
 
+def test_constant_actions(make):
+    """They cannot be scaled to [-1, 1]."""
+    env = gym.wrappers.TransformAction(gym.make("Pendulum-v1"), np.copy, gym.spaces.Box(1, 1, (1,)))
+    with pytest.raises(ValueError, match=re.escape("action_space=Box(1.0, 1.0, (1,), float32): expected low < high")):
+        make(env)
+
+
 @pytest.mark.parametrize("name, value", CASES, ids=lambda x: str(x))
 def test_numbers(make, name, value):
     refused(make, name, value)

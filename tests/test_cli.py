@@ -7,19 +7,27 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from sb3_symphony.cli import main, make_parser
 from sb3_symphony.experiment.config import TrainOptions
 from sb3_symphony.experiment.registry import ALGORITHMS
 
 
-class UnboundedEnv(gym.Env):
-    observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
-    action_space = gym.spaces.Box(-np.inf, np.inf, (1,))
+class ActionsEnv(gym.Env):
+    observation_space = spaces.Box(-1.0, 1.0, (2,))
+
+    def __init__(self, low, high, dtype=np.float32):
+        self.action_space = spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
 
 
 if "Unbounded-v0" not in gym.registry:
-    gym.register("Unbounded-v0", entry_point=UnboundedEnv)
+    for name, arguments in {
+        "Unbounded": {"low": [-np.inf], "high": [np.inf]},
+        "Whole": {"low": [0], "high": [5], "dtype": np.int64},
+        "Constant": {"low": [0, 1], "high": [1, 1]},
+    }.items():
+        gym.register(f"{name}-v0", entry_point=ActionsEnv, kwargs=arguments)
 
 
 @pytest.fixture(autouse=True)
@@ -150,6 +158,9 @@ def test_flags_reach_the_options(monkeypatch):
         ("--algo sac --env CartPole-v1", "its action space is Discrete(2) — sac needs a continuous one (Box)"),
         ("--algo td3 --env Unbounded-v0", "is unbounded — td3 needs finite limits"),
         ("--algo ppo --env Unbounded-v0", "is unbounded"),
+        ("--algo td3 --env Whole-v0", "its action space is Box(0, 5, (1,), int64) — td3 needs real numbers"),
+        ("--algo td3 --env Constant-v0", "its action 1 is always 1.0 — td3 needs low < high"),
+        ("--algo redq --env Constant-v0", "its action 1 is always 1.0 — redq needs low < high"),
         ("-params learning_ratee:1", "did you mean 'learning_rate'?"),
         ("-params learning_rate:fast", "learning_rate: 'fast' — expected a number or lin_<number>"),
         ("-params learning_rate:-1", "expected a number >= 0"),

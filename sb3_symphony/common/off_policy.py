@@ -161,6 +161,9 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self.tau, self.gamma = float(self.tau), float(self.gamma)  # powers of NumPy's would be in double precision
         if not np.issubdtype(self.action_space.dtype, np.floating):
             raise ValueError(f"action_space={self.action_space}: expected real numbers, scaled ones are not whole")
+        assert isinstance(self.action_space, spaces.Box)  # the only supported one
+        if not np.all(self.action_space.low < self.action_space.high):
+            raise ValueError(f"action_space={self.action_space}: expected low < high, an action that is constant has no scale")
         if not isinstance(self.train_freq, TrainFreq):
             frequency = self.train_freq[0] if isinstance(self.train_freq, tuple) else self.train_freq
             check_number("train_freq", frequency, 1, integer=True)

@@ -243,6 +243,12 @@ def check_spaces(env: VecEnv, env_id: str, algo: str, algorithm: type[BaseAlgori
         raise ConfigError(f"{env_id}: its action space is {space} — {algo} needs a continuous one (Box)")
     if isinstance(space, spaces.Box) and not np.all(np.isfinite([space.low, space.high])):
         raise ConfigError(f"{env_id}: its action space {space} is unbounded — {algo} needs finite limits")
+    if isinstance(space, spaces.Box) and not on_policy:  # which scales actions to [-1, 1]
+        if not np.issubdtype(space.dtype, np.floating):
+            raise ConfigError(f"{env_id}: its action space is {space} — {algo} needs real numbers")
+        if not np.all(space.low < space.high):
+            index = np.argmin(space.low < space.high)
+            raise ConfigError(f"{env_id}: its action {index} is always {space.low.flat[index]} — {algo} needs low < high")
     if not on_policy and isinstance(env, VecFrameStack) and unwrap_vec_normalize(env) is not None:
         # The replay keeps what VecNormalize was given, one observation at a time
         raise ConfigError(f"frame_stack: cannot be combined with normalize for {algo} — only for on-policy algorithms")
