@@ -1,8 +1,10 @@
 """Short real runs: what they leave on disk, what is learned from, what is reported."""
 
 import fcntl
+import json
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
@@ -24,10 +26,11 @@ from sb3_symphony.cli import main
 from sb3_symphony.common.wrappers import FreshBox2DWorld
 from sb3_symphony.experiment.config import ConfigError, RunSettings, TrainOptions, load_config, reason
 from sb3_symphony.experiment.environment import EpisodeSeeds, make_evaluation_env, make_training_env
+from sb3_symphony.experiment.export import export
 from sb3_symphony.experiment.run_folder import RunFolder
-from sb3_symphony.experiment.select import SelectOptions, select_model
+from sb3_symphony.experiment.select import ExportOptions, SelectOptions, select_model
 from sb3_symphony.experiment.signals import handled_by
-from sb3_symphony.experiment.train import train
+from sb3_symphony.experiment.train import TrainResult, train
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 50, "buffer_size": 1000, "batch_size": 16}
 FLOOR = [{"sb3_symphony.common.wrappers.RewardFloor": {"floor": -10}}]
@@ -103,6 +106,31 @@ def test_run_folder(folder, capsys):
     assert capsys.readouterr().out.startswith("# td3 on Pendulum-v1, ")
     assert main(["train", "-conf", str(details / "config.yml"), "--algo", "ddpg", "--dry-run"]) == 0
     assert capsys.readouterr().out.startswith("# ddpg on Pendulum-v1, ")
+
+
+@pytest.mark.parametrize("save_freq", [0, 100])
+def test_diverged(folder, capsys, save_freq):
+    flags = f"--env Pendulum-v1 -n 120 --seed 1 --eval-freq 0 --verbose 0 --save-freq {save_freq} --json -".split()
+    extreme = ["-params", "learning_rate:1e30", "learning_starts:20", "train_freq:1", "policy_kwargs.net_arch:[8]"]
+    assert main(["train", "--algo", "td3", *flags, *extreme]) == 0
+    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    assert run["diverged"] and run["steps"] == 120
+    assert train(options(n_timesteps=60)).plain()["diverged"] is False
+    result = TrainResult(RunFolder(Path(run["run"]), "Pendulum-v1"), 120, [], 1.0, diverged=True)
+    assert result.summary().splitlines()[1] == "its training has diverged, weights are not finite"
+    # Where a distribution refuses what the network gives, that is told in place of a traceback
+    assert main(["train", "--algo", "sac", *flags, *extreme]) == 2
+    told = "its training has diverged, weights are not finite"
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(rf"error: ValueError after \d+ steps: {told} — expected other hyper-parameters$", error)
+
+    told = f"Pendulum-v1.zip: {told}"
+    with pytest.raises(ConfigError, match=f"{told} — expected an agent that acts"):
+        export(ExportOptions(model=run["model"]))
+    with pytest.raises(ConfigError, match=f"-i: .*{told} — expected an agent that acts"):
+        train(options(trained_agent=run["run"], hyperparams={"policy_kwargs.net_arch": [8]}))
+    main(["evaluate", "--model", run["model"], "--n-episodes", "1"])
+    assert f"note: {run['model']}: its training" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("algo", ["symphony", "redq", "droq"])

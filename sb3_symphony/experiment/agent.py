@@ -33,6 +33,9 @@ from sb3_symphony.experiment.environment import (
 from sb3_symphony.experiment.registry import LOADABLE, load_algorithm
 from sb3_symphony.experiment.select import Selection, SelectOptions, select_model
 
+#: what is said of a model without :func:`finite_weights`
+DIVERGED = "its training has diverged, weights are not finite"
+
 
 class Step(NamedTuple):
     """
@@ -127,6 +130,8 @@ def open_agent(
     except BaseException:
         env.close()
         raise
+    if not finite_weights(model):
+        print(f"note: {selection.model}: {DIVERGED}", file=sys.stderr)
     return Agent(selection, model, env)
 
 
@@ -231,6 +236,14 @@ def load_model(selection: Selection, device: str = "auto") -> BaseAlgorithm:
             return algorithm.load(selection.model, device=device, custom_objects=_substitutes(), buffer_size=1)
     except Exception as error:  # a pickle can fail in any way
         raise ConfigError(f"{selection.model}: cannot be loaded as a model of {selection.algo} — {told(error)}") from error
+
+
+def finite_weights(model: BaseAlgorithm) -> bool:
+    """
+    :param model: a model
+    :return: whether all of its networks' weights are finite; else its training has diverged
+    """
+    return all(bool(th.isfinite(value).all()) for value in model.policy.state_dict().values() if value.is_floating_point())
 
 
 def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None:

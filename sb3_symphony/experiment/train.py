@@ -19,7 +19,7 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from sb3_symphony.common.buffers import check_mirror
 from sb3_symphony.common.checkpoint import Checkpoint, DoesNotFit, ExactCheckpoints, check_fit, platform_of
-from sb3_symphony.experiment.agent import check_device
+from sb3_symphony.experiment.agent import DIVERGED, check_device, finite_weights
 from sb3_symphony.experiment.callbacks import (
     NoteLogFolder,
     ReturnProgressBar,
@@ -61,6 +61,7 @@ class TrainResult:
     :param evaluation: returns of the last evaluation's episodes, empty if there was none
     :param seconds: wall-clock time of learning, that before a resume included
     :param interrupted: whether it was stopped by a signal
+    :param diverged: whether weights are not finite
     :param untouched: whether there was nothing left to do in a run that was to be resumed
     :param solved: whether that is because its ``stop_reward`` was reached
     """
@@ -70,6 +71,7 @@ class TrainResult:
     evaluation: list[float]
     seconds: float
     interrupted: bool = False
+    diverged: bool = False
     untouched: bool = False
     solved: bool = False
 
@@ -83,10 +85,11 @@ class TrainResult:
             "mean_reward": float(np.mean(self.evaluation)) if self.evaluation else None,
             "seconds": round(self.seconds, 3),
             "interrupted": self.interrupted,
+            "diverged": self.diverged,
         }
 
     def summary(self) -> str:
-        """:return: one line for the end of a run"""
+        """:return: one line for the end of a run, and a second one if it has diverged"""
         if self.untouched:
             onward = " (a larger -n goes on)" if not self.solved and any(self.run.checkpoints.glob("*.ckpt")) else ""
             reached = ", its stop_reward reached" if self.solved else ""
@@ -98,7 +101,8 @@ class TrainResult:
         minutes, seconds = divmod(round(self.seconds), 60)
         hours, minutes = divmod(minutes, 60)
         state = "interrupted, saved" if self.interrupted else "saved"
-        return f"{state} {self.run.model} | {self.steps} steps | {evaluated} | {hours}:{minutes:02}:{seconds:02} h"
+        line = f"{state} {self.run.model} | {self.steps} steps | {evaluated} | {hours}:{minutes:02}:{seconds:02} h"
+        return f"{line}\n{DIVERGED}" if self.diverged else line
 
 
 def build_model(options: TrainOptions, config: RunConfig, seed: int, verbose: int) -> BaseAlgorithm:
@@ -247,6 +251,18 @@ def _hindsight_told(model: BaseAlgorithm) -> Iterator[None]:
             f"learning_starts: {starts} — no episode had ended after {model.num_timesteps} steps, and hindsight replay needs "
             "one; expected more steps than an episode has"
         ) from None
+
+
+@contextmanager
+def _divergence_told(model: BaseAlgorithm) -> Iterator[None]:
+    """Networks' outputs that are no numbers stop distributions and environments in ways of their own."""
+    try:
+        yield
+    except Exception as error:
+        if finite_weights(model):
+            raise
+        kind, steps = type(error).__name__, model.num_timesteps
+        raise ConfigError(f"{kind} after {steps} steps: {DIVERGED} — expected other hyper-parameters") from error
 
 
 def effective_config(options: TrainOptions) -> RunConfig:
@@ -440,7 +456,8 @@ def _train(
     written = [run.path, *([Path(options.tensorboard_log)] if options.tensorboard_log else [])]
     with stop.listening(), full_disk_told(written, onward):
         try:
-            with _hindsight_told(model), _nothing_lost(model, run) if checkpoints is None else nullcontext():
+            keeping = _nothing_lost(model, run) if checkpoints is None else nullcontext()
+            with _divergence_told(model), _hindsight_told(model), keeping:
                 model.learn(total, callback=callbacks, **learn_arguments)
         except KeyboardInterrupt:
             stop.requested = True
@@ -456,4 +473,4 @@ def _train(
             checkpoints.save(rollout_follows=False)
     results = evaluation.evaluations_results if evaluation is not None else []
     last = [float(value) for value in results[-1]] if results else []
-    return TrainResult(run, model.num_timesteps, last, seconds, stop.requested and not finished)
+    return TrainResult(run, model.num_timesteps, last, seconds, stop.requested and not finished, not finite_weights(model))

@@ -22,6 +22,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_symphony.experiment.agent import finite_weights
 from sb3_symphony.experiment.callbacks import SeededEvaluation, StopOnSignal
 from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
 from sb3_symphony.experiment.environment import make_evaluation_env
@@ -69,14 +70,10 @@ class _SendEvaluations(BaseCallback):
         mean = float(self.parent.last_mean_reward)
         if not np.isfinite(mean):
             raise _Diverged(f"mean return {mean}")
-        if not _finite_weights(self.model):
+        if not finite_weights(self.model):
             raise _Diverged("weights that are not finite")
         self.results.send(mean)
         return self.n_calls < self.n_evaluations
-
-
-def _finite_weights(model: BaseAlgorithm) -> bool:
-    return all(bool(th.isfinite(value).all()) for value in model.policy.state_dict().values() if value.is_floating_point())
 
 
 def _failure(error: Exception, model: BaseAlgorithm | None) -> _Failure:
@@ -88,7 +85,7 @@ def _failure(error: Exception, model: BaseAlgorithm | None) -> _Failure:
         return _Failure(f"diverged: {error}", "failed")
     if isinstance(error, MemoryError | th.cuda.OutOfMemoryError) or "can't allocate memory" in str(error):
         return _Failure(f"out of memory: {what}", "failed")
-    if model is not None and not _finite_weights(model):
+    if model is not None and not finite_weights(model):
         return _Failure(f"diverged: weights that are not finite ({what})", "failed")
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     if str(frames[-1].f_globals.get("__name__")).startswith("torch.distributions"):  # where it checks network outputs
