@@ -118,6 +118,10 @@ def test_quick(write, tmp_path):
         ({"algorithms": [{"algo": "td3"}]}, "algorithms: name: missing"),
         ({"algorithms": [3]}, "algorithms: 3 — expected a name, or a mapping with 'name'"),
         ({"environments": ["a:B/C-v1", "B-C-v1"]}, "environments: 'B-C-v1' is there 2 times"),
+        (
+            {"environments": [{"id": "X", "threshold": -200, "unstable_below": -100}]},
+            "environments: unstable_below: -100 — expected at most the threshold, -200",
+        ),
         ({"environments": [{"id": "X", "treshold": 1}]}, "environments: unknown option 'treshold': did you mean 'threshold'?"),
         ({"protocol": "standart"}, "protocol: 'standart' — expected standard, or a mapping"),
         ({"protocol": {"eval_freq": -1}}, "protocol: eval_freq: -1 — expected a number >= 0"),

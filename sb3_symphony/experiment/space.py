@@ -300,7 +300,7 @@ def read_space(options: TuneOptions) -> SearchSpace:
     :raises ConfigError: if the file or one of its ranges is wrong
     """
     path = Path(shipped_folder() / "tuning" / f"{options.algo}.yml" if options.space is None else options.space)
-    content = read_yaml(path)
+    content = read_yaml(path, "a search space")
     where = str(path)
     name = entry_name(content, options.env, path)
     if name is not None:

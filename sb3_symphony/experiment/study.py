@@ -169,6 +169,12 @@ class Environment(BaseModel):
     unstable_below: FiniteFloat | None = None
     steps: Count | None = None
 
+    @model_validator(mode="after")
+    def _not_above_the_threshold(self) -> "Environment":
+        if self.threshold is not None and self.unstable_below is not None and self.unstable_below > self.threshold:
+            raise ConfigError(f"unstable_below: {self.unstable_below:g} — expected at most the threshold, {self.threshold:g}")
+        return self
+
 
 class Protocol(BaseModel):
     """
