@@ -158,7 +158,7 @@ def test_mappings_that_the_command_line_gives(tmp_path, given, searched):
 
 
 def test_missing_file():
-    with pytest.raises(ConfigError, match="^nowhere.yml: no such file — expected a YAML file of a search space$"):
+    with pytest.raises(ConfigError, match=r"^nowhere\.yml: no such file — expected a YAML file of a search space$"):
         read_space(TuneOptions(space="nowhere.yml"))
 
 

@@ -348,7 +348,7 @@ def validated(model: type[BaseModel], values: dict[str, Any]) -> Any:
             raise ConfigError(f"unknown option '{key}'{suggestion(key, model.model_fields)}") from None
         cause = first.get("ctx", {}).get("error")
         if isinstance(cause, ConfigError):  # from a part that is validated by itself
-            raise ConfigError(f"{key}: {cause}") from None
+            raise ConfigError(f"{key}: {cause}" if first["loc"] else str(cause)) from None
         message = (
             first["msg"].removeprefix("Value error, ").partition(", unable to")[0].replace("Input should be", "expected", 1)
         )
