@@ -210,6 +210,17 @@ def test_configuration_of_a_run_of_rl_zoo(folder, capsys):
     assert main(argv) == 0
     assert yaml.safe_load(capsys.readouterr().out)["env_kwargs"] == {"g": 9.0, **pixels}
     assert select(model=str(run), vecnormalize="none").settings.env_kwargs == {"g": 9.0, **pixels}
+    (run / "Pendulum-v1" / "args.yml").write_text("algo: ppo\nenv: Pendulum-v1\nenv_kwargs: [g, 9.0]\n")
+    assert main(argv) == 2
+    assert "env_kwargs: ['g', 9.0] — expected a mapping" in capsys.readouterr().err
+    fails("env_kwargs: ['g', 9.0] — expected a mapping", model=str(run))
+
+
+def test_configuration_of_ones_own_run_may_be_edited(folder, capsys):
+    run = make_run(folder / "logs", config={"env_kwargs": {"g": 5.0}}, env_kwargs={"g": 9.0}, protocol=None)
+    assert select(model=str(run)).settings.env_kwargs == {"g": 5.0}
+    assert main(["train", "-conf", str(run / "Pendulum-v1" / "config.yml"), "--dry-run"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out)["env_kwargs"] == {"g": 5.0}
 
 
 def test_pretrained_agents(folder, capsys):

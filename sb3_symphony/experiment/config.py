@@ -440,18 +440,31 @@ def _arguments_of_run(config: Path) -> dict[str, Any]:
     return read_yaml(path) if config.name == "config.yml" and path.is_file() else {}
 
 
+def is_zoo_run(arguments: dict[str, Any]) -> bool:
+    """
+    :param arguments: content of a run's ``args.yml``
+    :return: whether they are not those of this package's ``train``
+    """
+    return "protocol" not in arguments
+
+
 def with_env_kwargs(config: dict[str, Any], arguments: dict[str, Any]) -> dict[str, Any]:
     """
     :param config: content of a run's ``config.yml``
     :param arguments: content of its ``args.yml``, where alone RL Zoo keeps the arguments of the environment
     :return: the configuration with these
+    :raises ConfigError: if they are no mapping
     """
     given = arguments.get("env_kwargs")
-    if not given:
+    if not given or not is_zoo_run(arguments):
         return config
     config = dict(config)
     _read_expressions(config)
-    return {**config, "env_kwargs": {**(config.get("env_kwargs") or {}), **given}}
+    parts = [config.get("env_kwargs") or {}, given]
+    for part in parts:
+        if not isinstance(part, dict):
+            raise ConfigError(f"env_kwargs: {part!r} — expected a mapping")
+    return {**config, "env_kwargs": {**parts[0], **parts[1]}}
 
 
 def _override(plain: dict[str, Any], key: str, value: Any) -> None:

@@ -17,9 +17,17 @@ from torch.utils.tensorboard import SummaryWriter
 from sb3_symphony.analysis.runs import Evaluations, noted_log, read_evaluations
 from sb3_symphony.common.checkpoint import Checkpoint, checkpoint_files, newest_checkpoint
 from sb3_symphony.common.files import DamagedFile, write_atomically
-from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, load_config, read_yaml, validated
+from sb3_symphony.experiment.config import (
+    ConfigError,
+    RunConfig,
+    TrainOptions,
+    is_zoo_run,
+    load_config,
+    read_yaml,
+    validated,
+)
 from sb3_symphony.experiment.registry import without_folder
-from sb3_symphony.experiment.run_folder import RunFolder, is_zoo_run
+from sb3_symphony.experiment.run_folder import RunFolder
 
 #: options that may differ from those the run was started with. Schedules depend on the first of them, rounding on the
 #: device, results on no other

@@ -151,11 +151,3 @@ class RunFolder:
         contents["args.yml"] = texts[1]  # the last one: a folder that has it is complete
         for name, content in contents.items():
             write_atomically(self.details / name, content.encode())
-
-
-def is_zoo_run(arguments: dict[str, Any]) -> bool:
-    """
-    :param arguments: content of a run's ``args.yml``
-    :return: whether they are not those of this package's ``train``
-    """
-    return "protocol" not in arguments

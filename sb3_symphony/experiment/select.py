@@ -19,13 +19,14 @@ from sb3_symphony.experiment.config import (
     Threads,
     TrainOptions,
     check_algorithm,
+    is_zoo_run,
     read_yaml,
     run_settings,
     shipped_folder,
     with_env_kwargs,
 )
 from sb3_symphony.experiment.registry import LOADABLE, is_file, without_folder, without_module
-from sb3_symphony.experiment.run_folder import RunFolder, is_zoo_run, steps_in_name
+from sb3_symphony.experiment.run_folder import RunFolder, steps_in_name
 
 _DEFAULT_ALGO, _DEFAULT_ENV = TrainOptions().algo, TrainOptions().env
 
