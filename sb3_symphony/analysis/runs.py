@@ -342,9 +342,10 @@ def told_apart(run: Run) -> dict[str, Any]:
     :return: options that make it another experiment than one of the same configuration: what it starts from, without the
         number of that run, where it is evaluated, and arguments of the environment that RL Zoo keeps out of the configuration
     """
-    names = ["with_replay_buffer", "eval_env_kwargs"] + ["env_kwargs"] * ("env_kwargs" not in run.config)
-    start = re.sub(r"_\d+$", "", run.options.get("trained_agent") or "")
-    return {"trained_agent": start, **{name: run.options.get(name) for name in names}}
+    options = {name: run.options.get(name) for name in ("with_replay_buffer", "eval_env_kwargs")}
+    if "env_kwargs" not in run.config:
+        options["env_kwargs"] = run.options.get("env_kwargs")
+    return {"trained_agent": re.sub(r"_\d+$", "", run.options.get("trained_agent") or ""), **options}
 
 
 def group_runs(runs: Iterable[Run]) -> list[Group]:

@@ -246,6 +246,16 @@ def finite_weights(model: BaseAlgorithm) -> bool:
     return all(bool(th.isfinite(value).all()) for value in model.policy.state_dict().values() if value.is_floating_point())
 
 
+def check_finite(model: BaseAlgorithm, name: str) -> None:
+    """
+    :param model: a model
+    :param name: what it is called in the message
+    :raises ConfigError: if its training has diverged
+    """
+    if not finite_weights(model):
+        raise ConfigError(f"{name}: {DIVERGED} — expected an agent that acts")
+
+
 def _check_archive(selection: Selection, algorithm: type[BaseAlgorithm]) -> None:
     """Whether a file is a model of the algorithm at all, seen without unpickling anything."""
     path = selection.model

@@ -15,7 +15,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize, VecTransposeImage, unwrap_vec_normalize, unwrap_vec_wrapper
 from torch import nn
 
-from sb3_symphony.experiment.agent import DIVERGED, Agent, check_device, finite_weights, open_agent
+from sb3_symphony.experiment.agent import Agent, check_device, check_finite, open_agent
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.output import output_file, write_output
 from sb3_symphony.experiment.select import ExportOptions
@@ -166,8 +166,7 @@ def _normalization(agent: Agent) -> VecNormalize | None:
 
 def _check_exportable(agent: Agent) -> None:
     selection, model = agent.selection, agent.model
-    if not finite_weights(model):
-        raise ConfigError(f"{selection.model}: {DIVERGED} — expected an agent that acts")
+    check_finite(model, str(selection.model))
     if not isinstance(model.action_space, spaces.Box):
         raise ConfigError(f"{selection.model}: its actions are {model.action_space} — expected continuous ones (Box)")
     if not isinstance(model.observation_space, spaces.Box):

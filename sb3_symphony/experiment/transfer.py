@@ -18,7 +18,7 @@ from sb3_symphony.common.checkpoint import newest_checkpoint
 from sb3_symphony.common.checks import last_line
 from sb3_symphony.common.files import DamagedFile
 from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
-from sb3_symphony.experiment.agent import DIVERGED, check_match, finite_weights, load_model, load_normalization
+from sb3_symphony.experiment.agent import check_finite, check_match, load_model, load_normalization
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, of_networks, read_yaml, told
 from sb3_symphony.experiment.run_folder import RunFolder
 from sb3_symphony.experiment.select import Selection, SelectOptions, select_model
@@ -72,8 +72,7 @@ def start_from(model: BaseAlgorithm, selection: Selection, with_replay_buffer: b
         if "--vecnormalize" in str(error):  # a flag of other commands
             raise unknown from None
         raise ConfigError(f"-i: {error}") from None
-    if not finite_weights(trained):
-        raise ConfigError(f"-i: {selection.model}: {DIVERGED} — expected an agent that acts")
+    check_finite(trained, f"-i: {selection.model}")
     check_match(trained, env, str(selection.model), selection.env_id)
     _take_networks(model, trained, str(selection.model))
     assert model.seed is not None

@@ -513,14 +513,14 @@ def _tune(options: TuneOptions) -> TuneResult:
 def _open_study(plan: Plan, storage: SweepStorage) -> optuna.Study:
     options, steps = plan.options, plan.configuration["n_timesteps"]
     with storage.locked():
+        study = None
         if options.name in optuna.get_all_study_names(storage.optuna):
             study = optuna.load_study(study_name=options.name, storage=storage.optuna)
-            check_results(options.folder, options.name, study.get_trials(deepcopy=False))
-        else:
-            check_results(options.folder, options.name, [])
+        trials = [] if study is None else study.get_trials(deepcopy=False)
+        check_results(options.folder, options.name, trials)
+        if study is None:
             output_folder(options.folder, "--log-folder")
             study = optuna.create_study(study_name=options.name, storage=storage.optuna, direction="maximize")
-        trials = study.get_trials(deepcopy=False)
         if not study.user_attrs and not trials:  # the process that created it may have died before this
             study.set_user_attr(PLAN, plan.plain())
     plan.check_study(study, storage.name)
