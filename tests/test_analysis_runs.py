@@ -296,6 +296,16 @@ def test_arguments_of_the_environment_in_rl_zoo(tmp_path):
     ]
 
 
+def test_arguments_of_the_environment_in_both_files(tmp_path):
+    both = [({"g": 5.0}, {"g": 9.0}), ({"g": 5.0}, {"g": 3.0}), ({"g": 9.0}, {"g": 9.0}), ({"g": 9.0}, None)]
+    for number, (configured, given) in enumerate(both, 1):
+        path = make_run(tmp_path, number=number, env_kwargs=configured)
+        arguments = {"algo": "sac", "env": "X-v0", "seed": number, "env_kwargs": given}
+        (path / "X-v0" / "args.yml").write_text(yaml.safe_dump(arguments))
+    groups = group_runs(find_runs(tmp_path))
+    assert [[run.seed for run in group.runs] for group in groups] == [[1], [2], [3, 4]]  # 3 and 4: one pendulum
+
+
 def test_groups_are_told_apart_by_what_differs(tmp_path):
     paths = [
         make_run(tmp_path, number=1, gamma=0.9, policy_kwargs={"net_arch": [64], "n_critics": 2}),

@@ -234,6 +234,7 @@ def test_reduction(small, cls):
     [
         ("critic_engine", "fusd"),
         ("dropout_rate", -0.1),
+        ("dropout_rate", 1.0),
         ("dropout_rate", 1.5),
         ("dropout_rate", math.nan),
         ("dropout_rate", True),

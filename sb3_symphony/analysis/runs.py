@@ -343,8 +343,9 @@ def told_apart(run: Run) -> dict[str, Any]:
         number of that run, where it is evaluated, and arguments of the environment that RL Zoo keeps out of the configuration
     """
     options = {name: run.options.get(name) for name in ("with_replay_buffer", "eval_env_kwargs")}
-    if "env_kwargs" not in run.config:
-        options["env_kwargs"] = run.options.get("env_kwargs")
+    given, configured = run.options.get("env_kwargs"), run.config.get("env_kwargs")
+    if not (isinstance(given, dict) and isinstance(configured, dict) and given.items() <= configured.items()):
+        options["env_kwargs"] = given
     return {"trained_agent": re.sub(r"_\d+$", "", run.options.get("trained_agent") or ""), **options}
 
 
