@@ -160,6 +160,7 @@ def test_slope_reaches_the_sine_layers_only():
     "arguments",
     [
         dict(dropout_rate=1.0),
+        dict(dropout_rate=1.5),
         dict(dropout_rate=-0.1),
         dict(leaky_slope=-1.0),
         dict(net_arch=[0]),

@@ -344,8 +344,8 @@ def told_apart(run: Run) -> dict[str, Any]:
     """
     options = {name: run.options.get(name) for name in ("with_replay_buffer", "eval_env_kwargs")}
     given, configured = run.options.get("env_kwargs"), run.config.get("env_kwargs")
-    if not (isinstance(given, dict) and isinstance(configured, dict) and given.items() <= configured.items()):
-        options["env_kwargs"] = given
+    recorded = isinstance(given, dict) and isinstance(configured, dict) and given.items() <= configured.items()
+    options["env_kwargs"] = None if recorded else given
     return {"trained_agent": re.sub(r"_\d+$", "", run.options.get("trained_agent") or ""), **options}
 
 

@@ -11,10 +11,16 @@ import numpy as np
 
 
 def check_number(
-    name: str, value: Any, low: float = -math.inf, high: float = math.inf, integer: bool = False, exclusive: bool = False
+    name: str,
+    value: Any,
+    low: float = -math.inf,
+    high: float = math.inf,
+    integer: bool = False,
+    exclusive: bool = False,
+    below: float = math.inf,
 ) -> None:
     """
-    Refuse anything but a finite number in ``[low, high]``.
+    Refuse anything but a finite number in ``[low, high]``, smaller than ``below``.
 
     :param name: The argument's name
     :param value: Its value
@@ -22,20 +28,22 @@ def check_number(
     :param high: Largest value allowed
     :param integer: Whether only whole numbers are allowed
     :param exclusive: Whether ``low`` itself is refused
+    :param below: Smallest value that is too large
     :raises TypeError: if ``value`` is no number (of the kind asked for)
     :raises ValueError: if ``value`` is not finite or out of range
     """
     kind = "an integer" if integer else "a number"
-    bounds = f" {'>' if exclusive else '>='} {low:g}" if low > -math.inf else ""
-    bounds += f"{' and' if bounds else ''} <= {high:g}" if high < math.inf else ""
-    message = f"{name}={value!r}: expected {kind}{bounds}"
+    bounds = [f"{'>' if exclusive else '>='} {low:g}"] if low > -math.inf else []
+    bounds += [f"<= {high:g}"] if high < math.inf else []
+    bounds += [f"< {below:g}"] if below < math.inf else []
+    message = f"{name}={value!r}: expected {kind} {' and '.join(bounds)}".rstrip()
     try:
         number: Any = operator.index(value)  # of NumPy's integers too
     except TypeError:
         number = value
     if isinstance(value, bool) or not isinstance(number, int if integer else (int, float, np.floating)):
         raise TypeError(message)
-    if not math.isfinite(number) or not low <= number <= high or (exclusive and number == low):
+    if not math.isfinite(number) or not low <= number <= high or number >= below or (exclusive and number == low):
         raise ValueError(message)
 
 

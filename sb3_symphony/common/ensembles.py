@@ -46,9 +46,7 @@ def hidden_layers(
     :raises ValueError: if a width, the rate or the slope is out of range
     """
     check_net_arch(net_arch)
-    check_number("dropout_rate", dropout_rate, 0, 1)
-    if dropout_rate == 1:
-        raise ValueError(f"dropout_rate={dropout_rate!r}: expected a number < 1, or no unit is left")
+    check_number("dropout_rate", dropout_rate, 0, below=1)
     check_number("leaky_slope", leaky_slope, 0)
     for name, values in (("activation_fn", activation_fn), ("layer_norm", layer_norm)):
         if isinstance(values, Sequence) and not values:

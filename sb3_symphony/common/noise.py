@@ -186,8 +186,7 @@ class StickyActionNoise(DecayingActionNoise):
     ) -> None:
         super().__init__(n_actions, sigma, sigma_final, decay_steps, decay, n_envs)
         check_moving("independent", independent, 0)
-        if not 0 <= correlation < 1:
-            raise ValueError(f"correlation={correlation!r}: expected a number in [0, 1)")
+        check_number("correlation", correlation, 0, below=1)
         check_number("hold", hold, 1, integer=True)
         check_pair("episode_scale", episode_scale, "smallest, largest", 0)
         if episode_scale[0] > episode_scale[1]:
