@@ -234,6 +234,10 @@ def test_class_names():
             {"optimizer_class": "SGD", "optimizer_kwargs": {"betas": [0, 0]}},
             "unknown optimizer_kwargs key 'betas' for SGD",
         ),
+        ("sac", "policy_kwargs.optimizer_kwargs", {"eps": "small"}, "optimizer_kwargs: eps: 'small' — expected a number"),
+        ("sac", "policy_kwargs.optimizer_kwargs", {"betas": 0.9}, r"betas: 0.9 — expected \[a number, a number\]$"),
+        ("tqc", "top_quantiles_to_drop_per_net", 25, "25 — expected fewer than the n_quantiles of a critic, 25"),
+        ("tqc", "policy_kwargs.n_quantiles", 2, "top_quantiles_to_drop_per_net: 2 — expected fewer than the n_quantiles"),
         (
             "redq",
             "policy_kwargs.features_extractor_kwargs",
@@ -359,6 +363,16 @@ def test_shipped_hopper_entries_agree():
     for algo in ALGORITHMS:
         content = read_yaml(shipped_folder() / f"{algo}.yml")
         assert content["Hopper-v4"] == content["Hopper-v5"], algo
+
+
+def test_arguments_of_the_optimizer_as_it_takes_them():
+    arguments = decode("tqc", policy_kwargs={"optimizer_kwargs": {"betas": [0.9, 0.99], "eps": "1e-5"}})
+    assert arguments["policy_kwargs"]["optimizer_kwargs"] == {"betas": (0.9, 0.99), "eps": 1e-5}
+
+
+def test_one_quantile_of_a_critic_is_enough():
+    decode("tqc", top_quantiles_to_drop_per_net=24)
+    decode("tqc", policy_kwargs={"n_quantiles": 3})
 
 
 @pytest.mark.parametrize("value", [float("inf"), "1e-3", [3e-4]])

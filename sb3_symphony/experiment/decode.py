@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from pydantic import AfterValidator, ConfigDict, PydanticSchemaGenerationError, TypeAdapter, ValidationError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
@@ -164,6 +165,8 @@ def _describe(annotation: Any) -> str:
     alternatives = _alternatives(annotation)
     for alternative in alternatives:
         origin = get_origin(alternative)
+        if alternative is th.Tensor:  # torch's optimizers take them, a file has none
+            continue
         if isinstance(alternative, type) and alternative in words:
             if not (alternative is int and float in alternatives):
                 parts.append(words[alternative])
@@ -314,7 +317,11 @@ def _policy_kwargs(value: Any, policy_class: Any) -> dict[str, Any]:
         if given := decoded.get(f"{part}_kwargs"):
             default = constructor_parameters(policy_class)[f"{part}_class"].default
             class_ = decoded.get(f"{part}_class") or default or policy_class.default_features_extractor
-            check_keys(given, argument_types(class_).keys() - filled, f"{part}_kwargs key", class_.__name__)
+            known = argument_types(class_)
+            check_keys(given, known.keys() - filled, f"{part}_kwargs key", class_.__name__)
+            decoded[f"{part}_kwargs"] = {
+                name: _typed(f"{part}_kwargs: {name}", plain, plain, known[name], -math.inf) for name, plain in given.items()
+            }
     return decoded
 
 
@@ -341,6 +348,17 @@ def _check_replay(name: str, algorithm: Any, decoded: Mapping[str, Any]) -> None
         known = {key for class_ in classes for key in argument_types(class_)} - _BUFFER_RESERVED
         owner = " or ".join(dict.fromkeys(class_.__name__ for class_ in classes))
         check_keys(arguments, known, "replay_buffer_kwargs key", owner)
+
+
+def _check_quantiles(algorithm: Any, policy_class: Any, decoded: Mapping[str, Any]) -> None:
+    """TQC keeps some of each critic's quantiles; from none it would learn nothing, without a word."""
+    policy = {name: each.default for name, each in constructor_parameters(policy_class).items()}
+    if "n_quantiles" in policy:
+        name = "top_quantiles_to_drop_per_net"
+        dropped = decoded.get(name, constructor_parameters(algorithm)[name].default)
+        quantiles = {**policy, **(decoded.get("policy_kwargs") or {})}["n_quantiles"]
+        if dropped >= quantiles:
+            raise ConfigError(f"{name}: {dropped} — expected fewer than the n_quantiles of a critic, {quantiles}")
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -409,4 +427,5 @@ def algorithm_arguments(
     if isinstance(train_freq, tuple) and train_freq[1] == "episode" and settings.n_envs > 1:
         raise ConfigError(f"train_freq: {list(train_freq)!r} — expected steps where n_envs is {settings.n_envs}")
     _check_replay(name, algorithm, decoded)
+    _check_quantiles(algorithm, algorithm.policy_aliases[settings.policy], decoded)
     return {"policy": settings.policy, **decoded}
