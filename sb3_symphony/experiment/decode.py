@@ -236,7 +236,7 @@ def _typed(key: str, plain: Any, value: Any, annotation: Any, lowest: float) -> 
 
 
 def typed_arguments(
-    plain: Mapping[str, Any], class_: type, filled: Iterable[str], lowest: float = -math.inf
+    plain: Mapping[str, Any], class_: type, filled: Iterable[str], lowest: float = -math.inf, path: str = ""
 ) -> dict[str, Any]:
     """
     Check arguments of a class against its constructor.
@@ -245,12 +245,14 @@ def typed_arguments(
     :param class_: the class
     :param filled: arguments that a configuration does not give
     :param lowest: smallest number
+    :param path: the key of the configuration that holds them, for messages; else they name the class
     :return: the arguments, of the annotated types
     :raises ConfigError: for an unknown name or a wrong value
     """
     types = argument_types(class_)
-    check_keys(plain, types.keys() - {"self", *filled}, "argument", class_.__name__)
-    return {key: _typed(f"{class_.__name__}: {key}", value, value, types[key], lowest) for key, value in plain.items()}
+    check_keys(plain, types.keys() - {"self", *filled}, f"{path} key" if path else "argument", class_.__name__)
+    owner = path or class_.__name__
+    return {key: _typed(f"{owner}: {key}", value, value, types[key], lowest) for key, value in plain.items()}
 
 
 def _schedule(key: str, value: Any) -> Any:
@@ -317,11 +319,7 @@ def _policy_kwargs(value: Any, policy_class: Any) -> dict[str, Any]:
         if given := decoded.get(f"{part}_kwargs"):
             default = constructor_parameters(policy_class)[f"{part}_class"].default
             class_ = decoded.get(f"{part}_class") or default or policy_class.default_features_extractor
-            known = argument_types(class_)
-            check_keys(given, known.keys() - filled, f"{part}_kwargs key", class_.__name__)
-            decoded[f"{part}_kwargs"] = {
-                name: _typed(f"{part}_kwargs: {name}", plain, plain, known[name], -math.inf) for name, plain in given.items()
-            }
+            decoded[f"{part}_kwargs"] = typed_arguments(given, class_, filled, path=f"{part}_kwargs")
     return decoded
 
 
