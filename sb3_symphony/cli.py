@@ -84,6 +84,9 @@ _PLOT_EXAMPLES = """examples:
 
 
 _SEVERAL: Any = {"action": "extend", "nargs": "+"}  # a flag that is given twice adds to what it was
+#: arguments that are pairs, whose values are YAML -> their flags
+_PAIRS = {"hyperparams": "-params", "env_kwargs": "--env-kwargs", "eval_env_kwargs": "--eval-env-kwargs"}
+_PAIRS |= {"env_wrapper": "--env-wrapper"}
 
 
 _SEARCHES = (
@@ -219,10 +222,6 @@ def _add_train(commands: Any) -> None:
 
 
 def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
-    pairs = (("hyperparams", "-params"), ("env_kwargs", "--env-kwargs"), ("eval_env_kwargs", "--eval-env-kwargs"))
-    for name, flag in pairs:
-        if name in arguments:
-            arguments[name] = parse_pairs(arguments[name], flag)
     only_show = arguments.pop("dry_run", False)
     if arguments.get("json_file") == "-":
         arguments["quiet"] = True
@@ -254,6 +253,11 @@ def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     return 130 if results[-1].interrupted else 0
 
 
+def _wrapper(text: str) -> str:
+    """A wrapper's arguments may be left out."""
+    return text if ":" in text else f"{text}:{{}}"
+
+
 def _add_selection(parser: argparse.ArgumentParser, several: bool = False) -> None:
     """The flags of :class:`SelectOptions`, which all commands on trained agents share; ``several`` may be given by name."""
     add = partial(parser.add_argument_group("which agent").add_argument, default=argparse.SUPPRESS)
@@ -269,7 +273,7 @@ def _add_selection(parser: argparse.ArgumentParser, several: bool = False) -> No
     add("--load-last-checkpoint", action="store_true", help="model saved latest, of a run that did not end")
     add("--vecnormalize", metavar="PKL", help="statistics of VecNormalize, or none (default: the run's)")
     add("--env-kwargs", **_SEVERAL, metavar="K:V", help="arguments of the environment")
-    add("--env-wrapper", **_SEVERAL, metavar="W[:{K: V}]", help="wrappers of the environment, or arguments of the run's")
+    add("--env-wrapper", **_SEVERAL, type=_wrapper, metavar="W[:{K: V}]", help="wrappers, or arguments of the run's")
     add("--gym-packages", **_SEVERAL, metavar="M", help="modules to import, which register environments")
     add("--device", help="auto, cpu or cuda (default: auto)")
     add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch")
@@ -280,16 +284,6 @@ def _add_deterministic(parser: argparse.ArgumentParser) -> None:
     add = partial(either.add_argument, dest="deterministic", default=argparse.SUPPRESS)
     add("--deterministic", action="store_true", help="ask the policy for its mode (default)")
     add("--stochastic", action="store_false", help="ask it for samples")
-
-
-def _selection(model: type[SelectOptions], arguments: dict[str, Any]) -> Any:
-    """The options of a command on a trained agent."""
-    if "env_wrapper" in arguments:  # a wrapper's arguments may be left out
-        arguments["env_wrapper"] = [name if ":" in name else f"{name}:{{}}" for name in arguments["env_wrapper"]]
-    for name, flag in (("env_kwargs", "--env-kwargs"), ("env_wrapper", "--env-wrapper")):
-        if name in arguments:
-            arguments[name] = parse_pairs(arguments[name], flag)
-    return validated(model, arguments)
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -317,7 +311,7 @@ def _add_evaluate(commands: Any) -> None:
 
 def _evaluate(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     arguments.setdefault("progress", sys.stderr.isatty())
-    options = _selection(EvaluateOptions, arguments)
+    options = validated(EvaluateOptions, arguments)
 
     from sb3_symphony.experiment.evaluate import evaluate
 
@@ -353,7 +347,7 @@ def _add_enjoy(commands: Any) -> None:
 
 def _enjoy(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     del arguments["custom_objects"]
-    options = _selection(EnjoyOptions, arguments)
+    options = validated(EnjoyOptions, arguments)
 
     from sb3_symphony.experiment.enjoy import enjoy
 
@@ -375,7 +369,7 @@ def _add_export(commands: Any) -> None:
 
 
 def _export(arguments: dict[str, Any], argv: Sequence[str]) -> int:
-    options = _selection(ExportOptions, arguments)
+    options = validated(ExportOptions, arguments)
 
     from sb3_symphony.experiment.export import export
 
@@ -415,7 +409,7 @@ def _add_video(commands: Any) -> None:
 
 def _video(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     arguments.setdefault("progress", sys.stderr.isatty())
-    options = _selection(VideoOptions, arguments)
+    options = validated(VideoOptions, arguments)
 
     from sb3_symphony.experiment.video import video
 
@@ -442,7 +436,7 @@ def _add_gait(commands: Any) -> None:
 
 def _gait(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     arguments.setdefault("progress", sys.stderr.isatty())
-    options = _selection(GaitOptions, arguments)
+    options = validated(GaitOptions, arguments)
 
     from sb3_symphony.experiment.gait import gait
 
@@ -528,9 +522,6 @@ def _add_tune(commands: Any) -> None:
 
 
 def _tune(arguments: dict[str, Any], argv: Sequence[str]) -> int:
-    for name, flag in (("hyperparams", "-params"), ("env_kwargs", "--env-kwargs")):
-        if name in arguments:
-            arguments[name] = parse_pairs(arguments[name], flag)
     options = validated(TuneOptions, whose(arguments.get("conf_file")) | arguments)
     check_algorithm(options.algo)  # before the slow imports
 
@@ -656,6 +647,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments["progress"] = False
     quiet = silent and arguments.get("json_file") != "-"
     try:
+        arguments |= {name: parse_pairs(arguments[name], flag) for name, flag in _PAIRS.items() if name in arguments}
         with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere) if quiet else nullcontext():
             code = run(arguments, argv)
         sys.stdout.flush()

@@ -116,7 +116,7 @@ def test_bad_arguments(strata, arguments):
 def test_nan_is_not_left_out():
     assert np.isnan(iqm([1.0, 2.0, 3.0, math.nan]))
     np.testing.assert_equal(iqm([[1.0, math.nan], [2.0, 2.0]], axis=1), [math.nan, 2.0])
-    assert unstable_episodes([100, 200], [[300.0, 300.0], [math.nan, 300.0]], Event(True, 100)) == (1, 2)
+    assert unstable_episodes([100, 200], [[300.0, 300.0], [math.nan, 300.0]], Event(True, 100), below=200) == (1, 2)
 
 
 def test_summary():
@@ -140,20 +140,20 @@ STEPS = [100, 200, 300, 400, 500]
 )
 def test_first_stable_evaluation(means, event):
     results = np.array(means)[:, None] + [-10, 0, 10]
-    assert first_stable_evaluation(STEPS, results) == event
-    assert first_stable_evaluation([], np.empty((0, 3))) == Event(False, 0)
-    assert first_stable_evaluation([100], [[400.0]]) == Event(False, 0)
-    assert first_stable_evaluation([100, 200], [[math.nan], [1.0]]) == Event(False, 200)
+    assert first_stable_evaluation(STEPS, results, 300) == event
+    assert first_stable_evaluation([], np.empty((0, 3)), 300) == Event(False, 0)
+    assert first_stable_evaluation([100], [[400.0]], 300) == Event(False, 0)
+    assert first_stable_evaluation([100, 200], [[math.nan], [1.0]], 300) == Event(False, 200)
 
 
 def test_first_episode():
     returns, ends = [-100, 299.9, 300, 0, 500], [50, 150, 1000, 1100, 2000]
-    assert first_episode(ends, returns) == Event(True, 1000, 3)
+    assert first_episode(ends, returns, 300) == Event(True, 1000, 3)
     assert first_episode(ends, returns, threshold=501) == Event(False, 2000, 5)
-    assert first_episode(ends, returns, window=3) == Event(False, 2000, 5)
+    assert first_episode(ends, returns, 300, window=3) == Event(False, 2000, 5)
     assert first_episode(ends, returns, threshold=199.9, window=3) == Event(True, 1100, 4)
     assert first_episode(ends, returns, threshold=-1000, window=6) == Event(False, 2000, 5)
-    assert first_episode([], []) == Event(False, 0, 0)
+    assert first_episode([], [], 300) == Event(False, 0, 0)
 
 
 def test_first_episode_with_a_window_is_the_slow_one():
@@ -166,8 +166,8 @@ def test_first_episode_with_a_window_is_the_slow_one():
 def test_unstable_episodes():
     steps = [100_000, 110_000, 120_000, 200_000, 210_000]
     results = [[300, 100], [400, 400], [199, 200], [-5, 300], [0, 0]]
-    assert unstable_episodes(steps, results, Event(True, 100_000)) == (2, 6)  # neither its own evaluation nor later ones
-    assert unstable_episodes(steps, results, Event(False, 210_000)) == (0, 0)
+    assert unstable_episodes(steps, results, Event(True, 100_000), 200) == (2, 6)  # neither its own evaluation nor later ones
+    assert unstable_episodes(steps, results, Event(False, 210_000), 200) == (0, 0)
 
 
 @pytest.mark.parametrize(

@@ -561,10 +561,11 @@ number,state,value,reason,retry_of,evaluations,started,seconds,worker,seed_100,n
 """
 
 
-def test_a_table_of_trials_on_a_page(tmp_path):
+def test_a_table_of_trials_on_a_page(tmp_path, monkeypatch):
     """The trial that was tried again counts once; the earliest of equals first; what all have in common is no column."""
     (tmp_path / "trials.csv").write_text(TRIALS)
-    assert trials_table("rates", tmp_path / "trials.csv", 10, n_best=2).splitlines() == [
+    monkeypatch.setattr("sb3_symphony.experiment.sweep_report._N_BEST", 2)
+    assert trials_table("rates", tmp_path / "trials.csv", 10).splitlines() == [
         "### Search: rates",
         "",
         "4 of 10 trials (3 completed, 1 pruned, 1 running), 1.5 hours one after the other. The best:",

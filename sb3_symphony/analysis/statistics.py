@@ -15,6 +15,8 @@ from sb3_symphony.analysis.runs import Run
 
 #: environment seed of the first evaluation episode in the course of a training
 EVALUATION_SEED = 10_000
+#: environment steps after the first stable evaluation in which failures are counted
+STABLE_STEPS = 100_000
 #: numbers drawn at once, 32 MB
 _CHUNK = 4_000_000
 
@@ -129,7 +131,7 @@ class Event:
         return f"{'' if self.reached else '> '}{self.step}"
 
 
-def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold: float = 300.0) -> Event:
+def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold: float) -> Event:
     """
     The first of two consecutive evaluations whose mean return is at least the threshold ("S300").
 
@@ -149,7 +151,7 @@ def first_stable_evaluation(timesteps: ArrayLike, results: ArrayLike, threshold:
     return Event(False, int(steps[bad[-1]]) if len(bad) else 0)
 
 
-def first_episode(steps: ArrayLike, returns: ArrayLike, threshold: float = 300.0, window: int = 1) -> Event:
+def first_episode(steps: ArrayLike, returns: ArrayLike, threshold: float, window: int = 1) -> Event:
     """
     The first training episode at which the mean return of the latest ``window`` episodes is at least the threshold: "E300"
     with a window of 1, and with one of 100 "T300", Gymnasium's definition of a solved BipedalWalker.
@@ -170,23 +172,20 @@ def first_episode(steps: ArrayLike, returns: ArrayLike, threshold: float = 300.0
     return Event(False, int(ends[-1]) if len(ends) else 0, len(ends))
 
 
-def unstable_episodes(
-    timesteps: ArrayLike, results: ArrayLike, stable: Event, below: float = 200.0, within: int = 100_000
-) -> tuple[int, int]:
+def unstable_episodes(timesteps: ArrayLike, results: ArrayLike, stable: Event, below: float) -> tuple[int, int]:
     """
-    Evaluation episodes that failed after the evaluations had become stable.
+    Evaluation episodes that failed within :data:`STABLE_STEPS` after the evaluations had become stable.
 
     :param timesteps: environment steps of the evaluations, shape ``(n,)``
     :param results: their returns, shape ``(n, episodes)``
     :param stable: result of :func:`first_stable_evaluation`
     :param below: return of a failure is less than that
-    :param within: number of environment steps after the event that count
     :return: number of failures, and of all episodes that count; (0, 0) if evaluations never became stable
     """
     if not stable.reached:
         return 0, 0
     steps = np.asarray(timesteps, dtype=np.int64)
-    counted = np.asarray(results, dtype=np.float64)[(steps > stable.step) & (steps <= stable.step + within)]
+    counted = np.asarray(results, dtype=np.float64)[(steps > stable.step) & (steps <= stable.step + STABLE_STEPS)]
     return int((~(counted >= below)).sum()), counted.size  # NaN is a failure
 
 
@@ -232,7 +231,7 @@ class RunEvents:
     :param stable: first of two consecutive evaluations with mean return ≥ threshold ("S300")
     :param episode: first training episode with return ≥ threshold ("E300")
     :param trailing: first training episode at which the mean of the latest 100 is ≥ threshold ("T300")
-    :param unstable: failed evaluation episodes within 100 000 steps after ``stable``
+    :param unstable: failed evaluation episodes within :data:`STABLE_STEPS` after ``stable``
     :param unstable_of: number of evaluation episodes in that time
     :param best_evaluation: largest mean return of an evaluation; nan without evaluations
     :param best_episode: largest return of a training episode; nan without episodes

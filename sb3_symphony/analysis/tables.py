@@ -20,6 +20,7 @@ import numpy as np
 from sb3_symphony.analysis.runs import Run, Scalar, told_apart
 from sb3_symphony.analysis.statistics import (
     EVALUATION_SEED,
+    STABLE_STEPS,
     Event,
     RunEvents,
     bootstrap_interval,
@@ -422,8 +423,8 @@ def _meaning(results: Sequence[Result], names: Sequence[str]) -> list[str]:
     if "unstable" in names:
         below = f"{thresholds.unstable_below:g}"
         lines.append(
-            f"- unstable: evaluation episodes with return < {below} within 100 000 steps after S{thresholds.solved:g}, of all "
-            "seeds"
+            f"- unstable: evaluation episodes with return < {below} within {_number(STABLE_STEPS)} steps after "
+            f"S{thresholds.solved:g}, of all seeds"
         )
     lines.append("- maximum: largest mean return of an evaluation, median over seeds, in brackets that of the best seed")
     final = sorted({len(each.final) for each in results if len(each.final)})

@@ -242,7 +242,6 @@ class ExactCheckpoints(BaseCallback):
     :param files: gives the files (such as ``0.monitor.csv``) whose content belongs to the state
     :param checkpoint: where to go on from; ``learn()`` is then called as for the whole run, with the total number of steps
     :param wanted: asked at the start of each rollout whether a checkpoint is wanted there, for example before stopping
-    :param report: what to do with a message
     """
 
     def __init__(
@@ -254,7 +253,6 @@ class ExactCheckpoints(BaseCallback):
         files: Callable[[], Sequence[Path]] = tuple,
         checkpoint: Checkpoint | None = None,
         wanted: Callable[[], bool] = bool,
-        report: Callable[[str], None] = print,
     ) -> None:
         super().__init__()
         check_number("save_freq", save_freq, 1, integer=True)
@@ -265,7 +263,6 @@ class ExactCheckpoints(BaseCallback):
         self.callbacks = callbacks
         self.files = files
         self.wanted = wanted
-        self.report = report
         self.finished = False  # whether learn() came to its end, with everything learned that was experienced
         self._rollout_ended = False
         self._latest = 0 if checkpoint is None else checkpoint.steps
@@ -344,7 +341,7 @@ class ExactCheckpoints(BaseCallback):
                 state["rows before"] = self._rows_before
             seal(self.folder / f"checkpoint_{steps:09d}.ckpt", state)
         except OSError as error:
-            self.report(f"no checkpoint at {steps} steps: {error.strerror} — training goes on, older ones are unharmed")
+            print(f"no checkpoint at {steps} steps: {error.strerror} — training goes on, older ones are unharmed")
             return False
         self._segments_of[steps] = {segment.file for segment in state["segments"]}
         self._tidy(steps)
@@ -392,7 +389,7 @@ class ExactCheckpoints(BaseCallback):
             each_copy(model.env, "start_anew", episodes)
             self._start_anew()
             why = "replaying the actions did not reproduce the episode" if episodes else "the episodes were not recorded"
-            self.report(f"resumed at {checkpoint.steps} steps with fresh episodes, hence not bit for bit: {why}")
+            print(f"resumed at {checkpoint.steps} steps with fresh episodes, hence not bit for bit: {why}")
         if not state["rollout follows"] and getattr(model, "use_sde", False):
             owner: Any = getattr(model, "actor", model.policy)
             owner.reset_noise(model.n_envs)

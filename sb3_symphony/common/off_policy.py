@@ -31,10 +31,10 @@ from sb3_symphony.common.buffers import (
     end_trajectory,
 )
 from sb3_symphony.common.checks import check_choice, check_number, constructor_parameters, suggestion
+from sb3_symphony.common.cuda_graphs import CudaGraphs, recorded_state
 from sb3_symphony.common.ensembles import TARGET_MODES, EnsembleCritic
 from sb3_symphony.common.losses import CLASSIFICATION, CRITIC_LOSSES
 from sb3_symphony.common.noise import DecayingActionNoise
-from sb3_symphony.common.recordings import Recordings, recorded_state
 from sb3_symphony.common.regression import make_regression
 
 SelfEnsemble = TypeVar("SelfEnsemble", bound="EnsembleOffPolicyAlgorithm")
@@ -256,7 +256,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         self.critic_target = self.policy.critic_target
         self._has_batch_norm = bool(get_parameters_by_name(self.actor, ["running_"]))
         self._create_regression()  # of these critics
-        self._recordings = Recordings()
+        self._cuda_graphs = CudaGraphs()
 
     def _setup_learn(
         self,
@@ -396,7 +396,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             return {key: th.stack(list(each)) for key, each in values.items()}
 
         kind = state, n_batches, batch_size, n_updates % self.policy_delay, self.policy_delay, segment.discounts is None
-        outputs = self._recordings.run(kind, learn, segment, [self.actor.optimizer, self.critic.optimizer])
+        outputs = self._cuda_graphs.run(kind, learn, segment, [self.actor.optimizer, self.critic.optimizer])
         for key, values in outputs.items():
             logs[key].extend(values)
         # A replay does not count
@@ -551,7 +551,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
             raise ValueError(f"n_steps={self.n_steps}: the saved {kind} has no n-step returns, expected n_steps=1")
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression", "_recordings"]
+        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "_regression", "_cuda_graphs"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

@@ -1,7 +1,7 @@
 """
 The matrix products of stacked linear layers: by torch's BLAS, by compiled tiles, or in bfloat16.
 
-Torch's BLAS on x86 is Intel's, which computes with half the width of vectors that AMD's processors with AVX-512 have. There
+Torch's BLAS on x86 is Intel's, which computes with half the width of vectors that AMD's processors have from Zen 5 on. There
 the tiles are twice as fast.
 """
 

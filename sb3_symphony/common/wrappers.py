@@ -255,7 +255,7 @@ class StrideBonus(LearningReward):
         self.bonus, self.hips, self.offset, self.margin = float(bonus), hips, float(offset), float(margin)
         self.per_radian = per_radian
         self.in_front: bool | None = None  # whether the first leg was the last one in front
-        self.width = 0.0  # the most by which it has been in front since, in radians
+        self.width = 0.0  # the most by which the leg in front has led since it came there, in radians
         super().__init__(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

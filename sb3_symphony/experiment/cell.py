@@ -20,7 +20,6 @@ import sys
 import threading
 import time
 import traceback
-import zipfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,7 @@ from urllib.parse import quote
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.common.versions import package_versions, processor
 from sb3_symphony.experiment.config import ConfigError, TrainOptions
-from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.run_folder import RunFolder, saved_count
 from sb3_symphony.experiment.signals import ended_by
 
 #: seconds without a sign of life after which a cell stops by itself
@@ -285,7 +284,7 @@ def run_cell(job: Job) -> bool:
     content = {
         "n_timesteps": options.n_timesteps,
         "steps": result.steps,
-        "updates": _updates(run.model),
+        "updates": saved_count(run.model, "_n_updates"),
         "seconds": told["seconds"] if told is not None and told["n_timesteps"] == options.n_timesteps else seconds,
         "machine": _machine(options.device),
         **({"final": _evaluated(job, {})} if job.final_episodes else {}),
@@ -302,11 +301,6 @@ def _wait_for_predecessor(run: RunFolder) -> None:
     if run.checkpoints.is_dir():
         with suppress(Timeout), FileLock(run.checkpoints / ".lock", timeout=PATIENCE):
             pass
-
-
-def _updates(model: Path) -> int:
-    with zipfile.ZipFile(model) as archive:
-        return int(json.loads(archive.read("data"))["_n_updates"])
 
 
 def _machine(device: str) -> dict[str, Any]:

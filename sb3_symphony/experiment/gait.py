@@ -12,7 +12,7 @@ import numpy as np
 from sb3_symphony.analysis.gait import GaitNumbers, Recording, gait_numbers, plot_gait
 from sb3_symphony.analysis.style import SUFFIXES
 from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import json_report, output_file, progress_bar
+from sb3_symphony.experiment.output import columns, json_report, output_file, progress_bar
 from sb3_symphony.experiment.select import GaitOptions
 from sb3_symphony.experiment.video import Camera, Shown, show_agents
 
@@ -177,11 +177,7 @@ def _table(gaits: Sequence[Gait]) -> str:
     for name in gaits[0].numbers.symmetry:
         words = name.replace("_", " ")
         rows.append((f"symmetry index of {words} (%)", *(told(gait.numbers.symmetry[name], 0) for gait in gaits)))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join([row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))])
-        for row in rows
-    )
+    return "\n".join(columns(rows, left=1))
 
 
 def gait(options: GaitOptions) -> list[Gait]:

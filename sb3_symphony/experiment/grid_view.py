@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from sb3_symphony.experiment.output import columns
+
 if TYPE_CHECKING:
     from sb3_symphony.experiment.grid_progress import Progress
 
@@ -47,9 +49,7 @@ def plain_table(progress: "Sequence[Progress]") -> str:
     :return: state and steps of each, as text
     """
     rows = [(*_COLUMNS[:4], ""), *([*_cells(each)[:4], each.reason] for each in progress)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join([*lines, _counts(progress)])
+    return "\n".join([*columns(rows, left=len(rows[0])), _counts(progress)])
 
 
 class View:

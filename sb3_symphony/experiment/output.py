@@ -120,6 +120,17 @@ def _with_null(values: Any) -> Any:
     return None if isinstance(values, float) and not math.isfinite(values) else values
 
 
+def columns(rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """
+    :param rows: cells of a table, as many in each row
+    :param left: how many columns are aligned to the left; the others are to the right
+    :return: its lines
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    aligned = ([*map(str.ljust, row[:left], widths), *map(str.rjust, row[left:], widths[left:])] for row in rows)
+    return ["  ".join(cells).rstrip() for cells in aligned]
+
+
 def progress_bar(items: Iterable[_Item], what: str, shown: bool, total: float | None = None) -> Generator[_Item, None, None]:
     """
     :param items: what is worked through

@@ -1,6 +1,5 @@
 """A run that was stopped, killed or finished, and how it goes on."""
 
-import json
 import sys
 import zipfile
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from sb3_symphony.experiment.config import (
     validated,
 )
 from sb3_symphony.experiment.registry import without_folder
-from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.run_folder import RunFolder, saved_count
 
 #: options that may differ from those the run was started with. Schedules depend on the first of them, rounding on the
 #: device, results on no other
@@ -119,8 +118,7 @@ def model_steps(path: Path) -> int:
     :return: environment steps it was trained for, 0 if there is no such file or it is damaged
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            return int(json.loads(archive.read("data"))["num_timesteps"])
+        return saved_count(path, "num_timesteps")
     except (OSError, zipfile.BadZipFile, ValueError, KeyError, TypeError):
         return 0
 

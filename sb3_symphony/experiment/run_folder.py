@@ -1,6 +1,8 @@
 """The files of a run, laid out and named as RL Zoo does, so that scripts for its folders work here too."""
 
+import json
 import re
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,17 @@ def steps_in_name(model: Path) -> int | None:
     """
     name = re.fullmatch(r"rl_model_(\d+)_steps", model.stem)
     return int(name[1]) if name else None
+
+
+def saved_count(model: Path, name: str) -> int:
+    """
+    :param model: file of a model saved by SB3
+    :param name: attribute that counts something, such as ``num_timesteps``
+    :return: its value, read without loading the model
+    :raises OSError, zipfile.BadZipFile, ValueError, KeyError, TypeError: if there is no such file or it is damaged
+    """
+    with zipfile.ZipFile(model) as archive:
+        return int(json.loads(archive.read("data"))[name])
 
 
 @dataclass(frozen=True)

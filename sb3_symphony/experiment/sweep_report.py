@@ -18,6 +18,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_symphony.analysis.tables import aligned, as_csv
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge, told
+from sb3_symphony.experiment.output import columns
 from sb3_symphony.experiment.space import parse_space
 from sb3_symphony.experiment.sweep_storage import WORKER
 
@@ -26,6 +27,7 @@ PLAN = "plan"
 #: attributes of a trial: why it failed, in words; how it ended (see ``TrialFailed``); last mean return of each seed
 REASON, ENDED, RETURNS = "reason", "ended", "returns"
 
+_N_BEST = 5  # trials that are shown
 _FIGURES = ("optimization_history", "intermediate_values", "param_importances", "slice", "parallel_coordinate", "timeline")
 
 # States of trials in the order they are told, and their words
@@ -134,8 +136,8 @@ class SweepReport:
             }
             row |= dict(zip((f"seed_{seed}" for seed in self.plan["seeds"]), returns, strict=False))
             rows.append({**row, **{name: _cell(value) for name, value in self.space.values(trial.params).items()}})
-        columns = list(dict.fromkeys(column for row in rows for column in row))
-        return [{column: row.get(column) for column in columns} for row in rows]
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        return [{name: row.get(name) for name in names} for row in rows]
 
     def configuration(self, trial: FrozenTrial) -> dict[str, Any]:
         """
@@ -217,9 +219,8 @@ class SweepReport:
             return "\n".join([*lines, "no trial has completed yet"])
         names = list(best[0].params)
         table = [["trial", "value", *names]]
-        table += [[str(t.number), f"{t.value:.2f}", *map(parameters_of(t).__getitem__, names)] for t in best[:5]]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines += ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
+        table += [[str(t.number), f"{t.value:.2f}", *map(parameters_of(t).__getitem__, names)] for t in best[:_N_BEST]]
+        lines += columns(table, left=0)
         return "\n".join([*lines, f"best: trial {best[0].number}, {best[0].value:.2f} | {self.folder / 'best.yml'}"])
 
 
@@ -227,15 +228,14 @@ def _cell(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, list | dict) else value
 
 
-def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
+def trials_table(name: str, path: Path, n_trials: int) -> str:
     """
     A search on a page, from the table that :meth:`SweepReport.write` has left.
 
     :param name: name of the search
     :param path: its ``trials.csv``, which need not be there yet
     :param n_trials: how many trials it is to have
-    :param n_best: how many of the best are shown
-    :return: heading, what became of the trials, and the best ones with what differs between trials
+    :return: heading, what became of the trials, and the five best ones with what differs between trials
     :raises ConfigError: if that is no table of trials
     """
     heading = f"### Search: {name}\n\n"
@@ -258,7 +258,7 @@ def trials_table(name: str, path: Path, n_trials: int, n_best: int = 5) -> str:
         return f"{heading}{summary}\n"
     names = [column for column in rows[0] if not _ABOUT.fullmatch(column) and len({row[column] for row in rows}) > 1]
     table = [["trial", "mean return", *names]]
-    for value, number, row in sorted(completed)[:n_best]:
+    for value, number, row in sorted(completed)[:_N_BEST]:
         table.append([str(number), f"{-value:.2f}", *(_short(row[column]) for column in names)])
     return "\n".join([f"{heading}{summary} The best:", "", *aligned(table), ""])
 

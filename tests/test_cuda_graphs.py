@@ -1,6 +1,6 @@
 """
 Recorded updates: the same numbers as without. What CUDA does is tested where there is a GPU, which has to be shown to the
-tests: CUDA_VISIBLE_DEVICES=0 pytest tests/test_recordings.py. The rest is tested everywhere, with a graph that calls again.
+tests: CUDA_VISIBLE_DEVICES=0 pytest tests/test_cuda_graphs.py. The rest is tested everywhere, with a graph that calls again.
 """
 
 import copy
@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_symphony import REDQ, DroQ, Symphony
 from sb3_symphony.common.buffers import PrioritizedReplayBuffer
-from sb3_symphony.common.recordings import WARM_UPS, Recording, Recordings, recorded_state
+from sb3_symphony.common.cuda_graphs import WARM_UPS, CudaGraphs, Recording, recorded_state
 
 on_gpu = pytest.mark.skipif(not th.cuda.is_available(), reason="needs a GPU")
 
@@ -38,7 +38,7 @@ class Again:
             self.outputs.setdefault(key, th.empty_like(value)).copy_(value)
 
 
-class RecordingsOnCpu(Recordings):
+class GraphsOnCpu(CudaGraphs):
     def __init__(self):
         super().__init__()
         self.n_recorded = self.n_replayed = 0
@@ -64,7 +64,7 @@ def recorded(small, monkeypatch):
 
     def make(**kwargs):
         model = small(Symphony, **{**SETTINGS, **kwargs})
-        model._recordings = RecordingsOnCpu()
+        model._cuda_graphs = GraphsOnCpu()
         optimizers = [model.actor.optimizer, model.critic.optimizer]
         monkeypatch.setattr(model, "_recorded_state", lambda: recorded_state(model.policy, optimizers))
         return model
@@ -105,12 +105,12 @@ def test_recorded_updates_are_the_plain_ones(recorded, small, monkeypatch, gradi
     plain_logs = logged(plain, monkeypatch)
     plain.learn(70)
     assert_same(ours, plain, logs, plain_logs, rtol=0, atol=0)
-    assert ours._recordings.n_replayed > ours._n_updates / 20
-    assert ours._recordings.n_recorded < 16
+    assert ours._cuda_graphs.n_replayed > ours._n_updates / 20
+    assert ours._cuda_graphs.n_recorded < 16
 
 
 def test_calls_of_one_kind_are_recorded_once():
-    recordings, calls = RecordingsOnCpu(), []
+    recordings, calls = GraphsOnCpu(), []
     parameter = nn.Parameter(th.zeros(2))
     optimizer = th.optim.Adam([parameter])
 
@@ -134,12 +134,12 @@ def test_calls_of_one_kind_are_recorded_once():
 
 
 def test_the_latest_kinds_are_kept(monkeypatch):
-    monkeypatch.setattr("sb3_symphony.common.recordings.MAX_RECORDINGS", 3)
-    recordings = RecordingsOnCpu()
+    monkeypatch.setattr("sb3_symphony.common.cuda_graphs.MAX_RECORDINGS", 3)
+    recordings = GraphsOnCpu()
     for kind in [*"abcab", *"ddd", "a"]:
         recordings.run(kind, lambda samples: {}, (), [])
-    assert list(recordings._recordings) == ["b", "d", "a"]
-    assert recordings._recordings["a"] == 3 and recordings._recordings["d"] == 3
+    assert list(recordings._graphs) == ["b", "d", "a"]
+    assert recordings._graphs["a"] == 3 and recordings._graphs["d"] == 3
 
 
 def test_a_recording_is_not_used_once_something_it_depends_on_changes(small):
@@ -215,7 +215,7 @@ def test_nothing_is_recorded_before_optimizers_have_states(small):
 
 def test_nothing_is_recorded_on_the_cpu(small):
     model = small(Symphony).learn(60)
-    assert model._recorded_state() is None and not model._recordings._recordings
+    assert model._recorded_state() is None and not model._cuda_graphs._graphs
 
 
 def test_only_our_own_updates_are_recorded(small):
@@ -259,7 +259,7 @@ def test_graphs_compute_what_autograd_does(monkeypatch, critic_loss):
         model = on_cuda(engine, **kwargs)
         logs = logged(model, monkeypatch)
         model.learn(70)
-        graphs = sum(isinstance(each, Recording) for each in model._recordings._recordings.values())
+        graphs = sum(isinstance(each, Recording) for each in model._cuda_graphs._graphs.values())
         assert (graphs > 0) == (engine == "auto")
         results.append((model, logs))
     (ours, logs), (plain, plain_logs) = results
@@ -277,7 +277,7 @@ def test_graphs_follow_learning_rates(monkeypatch):
         model, "_log_update", lambda *args: weights.append(model.critic.q_networks.layers[0].weight.detach().clone())
     )
     model.learn(100)
-    assert any(isinstance(each, Recording) for each in model._recordings._recordings.values())
+    assert any(isinstance(each, Recording) for each in model._cuda_graphs._graphs.values())
     assert not th.equal(weights[20], weights[21])
     assert th.equal(weights[-1], weights[-5])  # in the last fifth they stand still
     assert isinstance(model.critic.optimizer.param_groups[0]["lr"], float)
@@ -299,5 +299,5 @@ def test_graphs_after_loading(tmp_path, monkeypatch):
         loaded.learn(20, reset_num_timesteps=False)
         results.append((loaded, logs))
     (ours, logs), (plain, plain_logs) = results
-    assert any(isinstance(each, Recording) for each in ours._recordings._recordings.values())
+    assert any(isinstance(each, Recording) for each in ours._cuda_graphs._graphs.values())
     assert_same(ours, plain, logs, plain_logs, rtol=2e-3, atol=2e-4)

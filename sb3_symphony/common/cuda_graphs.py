@@ -31,7 +31,7 @@ class Recording(NamedTuple):
     rates: list[th.Tensor]
 
 
-class Recordings:
+class CudaGraphs:
     """
     Calls of functions that work on a GPU, which are replayed from the fourth call of a kind on.
 
@@ -39,10 +39,10 @@ class Recordings:
     """
 
     def __init__(self) -> None:
-        self._recordings: dict[Hashable, Recording | int] = {}  # or the number of calls so far
+        self._graphs: dict[Hashable, Recording | int] = {}  # or the number of calls so far
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_recordings": {}}
+        return {"_graphs": {}}
 
     def run(
         self,
@@ -58,16 +58,16 @@ class Recordings:
         :param optimizers: All that the function steps
         :return: What the function returns
         """
-        known = self._recordings.pop(kind, 0)
+        known = self._graphs.pop(kind, 0)
         if isinstance(known, int) and known < WARM_UPS:
             outputs, known = self._warm_up(function, samples), known + 1
         else:
             if isinstance(known, int):
                 known = self._record(function, samples, optimizers)
             outputs = self._replay(known, samples, optimizers)
-        self._recordings[kind] = known  # now the latest
-        while len(self._recordings) > MAX_RECORDINGS:
-            del self._recordings[next(iter(self._recordings))]
+        self._graphs[kind] = known  # now the latest
+        while len(self._graphs) > MAX_RECORDINGS:
+            del self._graphs[next(iter(self._graphs))]
         return outputs
 
     def _warm_up(self, function: Callable[[Any], Outputs], samples: Any) -> Outputs:
