@@ -12,7 +12,16 @@ from matplotlib.text import Text
 from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis import plots
-from sb3_symphony.analysis.plots import block_mean, plot_scalars, plot_training, running_mean, scalar_curve, summarised
+from sb3_symphony.analysis.plots import (
+    NotRecorded,
+    block_mean,
+    evaluation_curve,
+    plot_scalars,
+    plot_training,
+    running_mean,
+    scalar_curve,
+    summarised,
+)
 from sb3_symphony.analysis.runs import open_run, read_scalars
 from sb3_symphony.analysis.statistics import bootstrap_interval, iqm
 from sb3_symphony.analysis.style import COLORS, line_style, save, spread
@@ -225,6 +234,17 @@ def test_evaluations(logs, figures, axis, scale):
     np.testing.assert_allclose(bold[0], np.arange(200, 2001, 200) * scale)
     np.testing.assert_allclose(bold[1], iqm(seeds, axis=0))
     np.testing.assert_allclose([y for _, y in faint], seeds)
+
+
+def test_time_after_the_last_training_episode(tmp_path):
+    """It goes on at the mean speed until then; without an episode nothing is known of it."""
+    run = make_run(tmp_path, "sac", "X-v0", 1, np.arange(4.0), seconds_per_episode=30.0)
+    np.savez(run / "evaluations.npz", timesteps=[200, 400, 500, 800], results=np.ones((4, 1)), ep_lengths=np.ones((4, 1)))
+    assert evaluation_curve(open_run(run), "time", "reward")[0] == pytest.approx([60, 120, 150, 240])
+    assert evaluation_curve(open_run(run), "episodes", "reward")[0] == pytest.approx([2, 4, 4, 4])
+    (run / "0.monitor.csv").write_text('#{"t_start": 5.0}\nr,l,t\n')
+    with pytest.raises(NotRecorded, match="no training episode has ended"):
+        evaluation_curve(open_run(run), "time", "reward")
 
 
 def test_scalars(logs, figures, capsys):

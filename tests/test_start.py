@@ -92,6 +92,34 @@ def test_weights_and_optimisers_come_along_and_counters_start_anew(algo):
         assert th.equal(model.log_ent_coef, trained.log_ent_coef) and model.log_ent_coef.item() != 0
 
 
+@pytest.mark.parametrize("algo", ["sac", "redq"])
+def test_what_the_agents_run_did_not_set_is_not_the_files(algo, folder):
+    """The file's networks would take the weights, or not, and be another agent."""
+    plain = {key: value for key, value in SMALL.items() if key != "policy_kwargs"}
+    (folder / "plain.yml").write_text(yaml.safe_dump({"n_timesteps": 60, **plain}))
+    own = {"policy_kwargs": {"activation_fn": "Tanh"}, "use_sde": True, "normalize": True}
+    (folder / "own.yml").write_text(yaml.safe_dump({"n_timesteps": 60, **plain, **own}))
+    first = train(options(algo, n_timesteps=60, hyperparams={}, conf_file="plain.yml")).run
+    again = options(algo, n_timesteps=60, hyperparams={}, conf_file="own.yml", trained_agent=str(first.path))
+    second = train(again).run
+    assert not set(own) & set(yaml.safe_load((second.details / "config.yml").read_text()))
+    model = load_algorithm(algo).load(second.model)
+    assert "Tanh" not in str(model.policy) and not model.use_sde
+    shown = dry_run(again)
+    assert shown["policy_kwargs"][1].startswith("default of")
+    given = again.model_copy(update={"hyperparams": {"policy_kwargs": {"activation_fn": "Tanh"}}})
+    assert dry_run(given)["policy_kwargs.activation_fn"] == ("Tanh", "-params")
+
+
+def test_items_of_a_mapping_that_is_not_set():
+    """As a dry run shows policy_kwargs that nobody gave."""
+    given = {"policy_kwargs": None, "policy_kwargs.net_arch": [8], "replay_buffer_kwargs.a.b": 1}
+    plain = load_config(options(hyperparams=given)).plain
+    assert (plain["policy_kwargs"], plain["replay_buffer_kwargs"]) == ({"net_arch": [8]}, {"a": {"b": 1}})
+    with pytest.raises(ConfigError, match=r"'gamma\.x' — 'gamma' is not a mapping"):
+        load_config(options(hyperparams={"gamma": 0.9, "gamma.x": 1}))
+
+
 def test_run_from_a_trained_agent(folder):
     first = train(options(hyperparams={**SMALL, "policy_kwargs": {"net_arch": [9], "activation_fn": "Tanh"}})).run
     second = train(options(hyperparams={"learning_starts": 50}, trained_agent=str(first.model))).run
@@ -601,6 +629,7 @@ def test_what_a_dry_run_prints_is_the_same_configuration(folder, algo):
     [
         ({"log_folder": "file"}, "--log-folder: 'file' cannot be written"),
         ({"tensorboard_log": "file/x"}, "--tensorboard-log: 'file/x' cannot be written"),
+        ({"tensorboard_log": "logs [1]"}, "--tensorboard-log: 'logs [1]' — expected a path without *, ? and ["),
         ({"hyperparams": {**SMALL, **MIRRORED}}, "mirror: expected observations as they are, not normalised ones"),
     ],
 )

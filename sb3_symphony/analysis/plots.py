@@ -152,8 +152,12 @@ def _located(run: Run, steps: np.ndarray, x: XAxis) -> np.ndarray:
     if x == "steps":
         return steps
     ends, seconds = _episodes_of(run, f"an axis of {x}")
-    known = np.arange(1, len(ends) + 1) if x == "episodes" else seconds
-    return np.interp(steps, np.concatenate([[0], ends]), np.concatenate([[0], known]))
+    if x == "episodes":
+        return np.interp(steps, np.concatenate([[0], ends]), np.arange(len(ends) + 1))
+    if len(ends) == 0:
+        raise NotRecorded(f"{run.path}: no training episode has ended — expected one for an axis of time")
+    at = np.interp(steps, np.concatenate([[0], ends]), np.concatenate([[0], seconds]))
+    return np.where(steps > ends[-1], seconds[-1] * steps / ends[-1], at)  # later: at the mean speed until then
 
 
 def _not_told(run: Run) -> NotRecorded:
@@ -190,7 +194,8 @@ def evaluation_curve(run: Run, x: XAxis, y: YAxis, max_steps: int | None = None)
     Evaluations of a run as a line.
 
     :param run: the run
-    :param x: axis to draw against; time and episodes are interpolated between the ends of training episodes
+    :param x: axis to draw against; time and episodes are interpolated between the ends of training episodes,
+        after the last one time goes on at the mean speed until then
     :param y: what to draw, the mean over the episodes of each evaluation
     :param max_steps: later environment steps are left out; None: nothing is
     :return: x and y

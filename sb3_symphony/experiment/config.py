@@ -471,7 +471,9 @@ def _override(plain: dict[str, Any], key: str, value: Any) -> None:
     """``policy_kwargs.net_arch`` changes one item of a mapping, ``policy_kwargs`` replaces all of it."""
     *parents, last = key.split(".")
     for parent in parents:
-        plain = plain.setdefault(parent, {})
+        if plain.get(parent) is None:
+            plain[parent] = {}
+        plain = plain[parent]
         if not isinstance(plain, dict):
             raise ConfigError(f"-params: '{key}' — '{parent}' is not a mapping")
     plain[last] = value
@@ -510,13 +512,15 @@ def load_config(options: TrainOptions, inherited: Mapping[str, Any] | None = Non
     Merge the shipped entry (or the given file instead of it) with the command line, later ones winning.
 
     :param options: options of the command line
-    :param inherited: values that go before those of the file, such as the networks of an agent to start from
+    :param inherited: values that go before those of the file, such as the networks of an agent to start from; None: a key of
+        the file is left out
     :return: the configuration, of which the algorithm's keys are yet to be checked
     :raises ConfigError: if a file or a key of the run is wrong
     """
     check_algorithm(options.algo)
     _, entry = find_entry(options)
-    return merge({**entry, **(inherited or {})}, options)
+    others = {key: value for key, value in entry.items() if key not in (inherited or {})}
+    return merge({**others, **{key: value for key, value in (inherited or {}).items() if value is not None}}, options)
 
 
 #: what settles the networks of an agent and what they are given
@@ -526,9 +530,10 @@ _NETWORKS = ("policy", "policy_kwargs", "n_critics", "use_sde", "normalize", "fr
 def of_networks(config: dict[str, Any]) -> dict[str, Any]:
     """
     :param config: configuration of a run
-    :return: those of its keys that its networks depend on, which an agent that starts from them has to share
+    :return: the keys that its networks depend on, which an agent that starts from them has to share; None for what it had by
+        default
     """
-    return {key: config.get(key) for key in _NETWORKS if config.get(key) is not None or key in ("normalize", "frame_stack")}
+    return {key: config.get(key) for key in _NETWORKS}
 
 
 def merge(entry: dict[str, Any], options: TrainOptions) -> RunConfig:

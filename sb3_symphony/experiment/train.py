@@ -1,5 +1,6 @@
 """One training run, from options to files on disk."""
 
+import glob
 import shlex
 import sys
 import time
@@ -330,6 +331,11 @@ def check_folders(options: TrainOptions, folder: Path | None = None, begins: boo
         check_folder(options.log_folder if folder is None else folder.parent, "--log-folder")
     if options.tensorboard_log:
         check_folder(options.tensorboard_log, "--tensorboard-log")
+        if begins and folder is None and glob.escape(options.tensorboard_log) != options.tensorboard_log:
+            raise ConfigError(
+                f"--tensorboard-log: '{options.tensorboard_log}' — expected a path without *, ? and [, in which SB3 would not "
+                "see earlier logs, and write into them"
+            )
 
 
 def train_seeds(options: TrainOptions, command: str | None = None) -> list[TrainResult]:
