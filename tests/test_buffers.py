@@ -107,7 +107,7 @@ def test_fade_factor_refused(factor):
         FadingReplayBuffer(5, OBS, ACT, fade_factor=factor)
 
 
-@pytest.mark.parametrize("power", [0, -2.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("power", [0, -2.0, 100.5, float("nan"), float("inf")])
 def test_fade_power_refused(power):
     with pytest.raises(ValueError, match="fade_power="):
         FadingDictReplayBuffer(5, DICT_OBS, ACT, fade_power=power)

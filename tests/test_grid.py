@@ -611,11 +611,17 @@ def test_results_are_not_collected_into_themselves(whole, folder, capsys):
     shutil.copytree(whole, folder / "copy")
     (folder / "link").symlink_to(folder / "copy")
     study, runs = str(whole.parent / "study.yml"), [folder / "copy" / name for name in CELLS]
-    before = contents(*runs)
+    page = folder / "pages" / "page.md"
+    page.parent.mkdir()
+    page.write_text("<!-- results -->\nold\n<!-- /results -->\n")
+    (folder / "copy" / "table.md").unlink()
+    before = contents(*runs, page.parent)
     for name in ("copy", "link", "link/../copy"):
-        message = fails(capsys, "bench", study, "-f", "copy", "--report", "--collect", name)
+        message = fails(capsys, "bench", study, "-f", "copy", "--report", "--page", str(page), "--collect", name)
         assert "expected another folder than that of the results" in message
-    assert contents(*runs) == before
+    message = fails(capsys, "bench", study, "-f", "copy", "--report", "--page", str(page), "--collect", str(page))
+    assert "--collect: " in message and "it is no folder" in message
+    assert contents(*runs, page.parent) == before and not (folder / "copy" / "table.md").exists()
     assert "collect: ''" in fails(capsys, "bench", study, "-f", "copy", "--report", "--collect", "")
 
 

@@ -243,6 +243,21 @@ def test_a_search_of_another_space(study, tmp_path, fails):
     assert main(["bench", str(tmp_path / "study.yml"), "-f", str(study / "results"), "--dry-run", "-a", "base"]) == 0
 
 
+@pytest.mark.parametrize("damaged", ["{", "[]"])
+def test_a_damaged_plan_of_a_search(study, tmp_path, fails, damaged):
+    for name in ("sweeps", "settings"):
+        shutil.copytree(study / "results" / name, tmp_path / "results" / name)
+    (plan,) = (tmp_path / "results" / "sweeps").glob("td3/tune/*/plan.json")
+    plan.write_text(damaged)
+    fails(["bench", str(study / "study.yml"), "--report", "-f", str(tmp_path / "results")], f"'{plan}' is damaged — ")
+
+
+def test_a_folder_that_is_none(study, tmp_path, fails):
+    (tmp_path / "file").touch()
+    for flags in ([], ["--dry-run"]):
+        fails(["bench", str(study / "study.yml"), "-f", str(tmp_path / "file"), *flags], "-f: '", "file' cannot be written")
+
+
 def test_a_search_is_checked_before_anything_runs(tmp_path, fails):
     (tmp_path / "own_td3.py").write_text(OWN)
     (tmp_path / "space.yml").write_text("gamma: [0.9, 1.5]\n")

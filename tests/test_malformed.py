@@ -135,7 +135,7 @@ COMMANDS = {
         "--seeds-per-trial": BAD_COUNT,
         "--n-jobs": NO_NUMBER | st.just("0") | st.integers(max_value=-2).map(str),
         "--timeout": NO_NUMBER | st.floats(max_value=-1e-9).map(str),
-        "--study-name": st.sampled_from(["", ".", "..", "a/b"]) | st.text("a", min_size=201, max_size=201),
+        "--study-name": st.sampled_from(["", ".", "..", "a/b", "ä" * 101]) | st.text("a", min_size=201, max_size=201),
         "--sampler": TEXT.filter(lambda text: text not in ("tpe", "random", "gp", "cmaes")),
         "--pruner": TEXT.filter(lambda text: text not in ("median", "halving", "hyperband", "none")),
         "--space": NO_FILE | st.sampled_from(["sac.zip", ".", "", "logs"]),

@@ -11,6 +11,7 @@ import yaml
 
 from sb3_symphony.cli import main
 from sb3_symphony.experiment.config import ConfigError, shipped_folder
+from sb3_symphony.experiment.grid_report import on_page
 from sb3_symphony.experiment.select import EvaluateOptions
 from sb3_symphony.experiment.study import cells_of, configuration, read_study, sweep_options
 
@@ -100,6 +101,7 @@ def test_quick(write, tmp_path):
         ({"seed": 3}, "unknown option 'seed': did you mean 'seeds'?"),
         ({"seeds": []}, "seeds: [] — expected at least one"),
         ({"seeds": 0}, "seeds: 0 — expected at least one"),
+        ({"seeds": [True, 2]}, "seeds: [True, 2] — expected a whole number"),
         ({"seeds": -1}, "seeds: -1 — expected at least one"),
         ({"seeds": 20_240_101}, "seeds: 20240101 — expected how many seeds, or a list of them: [20240101] is one seed"),
         ({"seeds": [1, 2, 1]}, "seeds: 1 is there 2 times — expected every cell once"),
@@ -404,16 +406,26 @@ def test_chance_of_ranks(runs, others, expected):
 
 def test_a_page_needs_its_marks(write, tmp_path, capsys):
     path, page = write(), tmp_path / "page.md"
-    for content, message in (("", "expected one line '<!-- results -->'"), (None, "cannot be read")):
+    start, end = "<!-- results -->\n", "<!-- /results -->\n"
+    one = "expected one line '<!-- results -->'"
+    texts = ("", end + start, f"{start}kept\n{start}{end}", start + end + "kept\n" + end, start.strip() + end)
+    for content, message in (*((text, one) for text in texts), (None, "cannot be read")):
         if content is not None:
             page.write_text(content)
         else:
             page.unlink()
         assert main(["bench", str(path), "--report", "--page", str(page)]) == 2
         assert message in capsys.readouterr().err
-    page.write_text("<!-- results -->\n<!-- /results -->\n")
+        assert content is None or page.read_text() == content
+    page.write_text(start + end)
     assert main(["bench", str(path), "--page", str(page)]) == 2
     assert "belongs to --report" in capsys.readouterr().err
+
+
+def test_a_page_keeps_its_ends_of_lines(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_bytes("Ü\r\n<!-- results -->\r\nold\r\n<!-- /results -->\r\nend\n".encode())
+    assert on_page(str(page), "a\nb") == "Ü\r\n<!-- results -->\r\n\r\na\r\nb\r\n<!-- /results -->\r\nend\n"
 
 
 def test_no_study_file(tmp_path):

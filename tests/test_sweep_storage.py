@@ -231,6 +231,8 @@ def test_wrong_addresses(postgres, opened):  # noqa: F811
         (postgres.url().replace(str(postgres.port), "1"), "(?i)connection refused"),
         (postgres.url().replace("postgresql", "postgress"), "unknown kind of storage 'postgress': did you mean 'postgresql'"),
         ("mysql://me@host/db", "unknown kind of storage 'mysql' — expected postgresql"),
+        ("postgresql:/me@host/db", "not a URL — expected postgresql://user"),
+        ("postgres:me@host/db", "not a URL — expected postgresql://user"),
         ("postgresql://me@host:port/db", "not a URL — expected postgresql://user"),
         ("postgresql+nonsense://me@host/db", "cannot be used"),
     ]:

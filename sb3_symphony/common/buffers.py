@@ -32,7 +32,7 @@ from sb3_symphony.common.mirror import Mirror
 def _check_fading(fade_factor: float | None, fade_power: float) -> None:
     if fade_factor is not None and not (isinstance(fade_factor, int | float | np.number) and fade_factor > 0):  # NaN neither
         raise ValueError(f"fade_factor={fade_factor!r}: expected a number > 0, or None (or inf) for uniform sampling")
-    check_number("fade_power", fade_power, 0, exclusive=True)
+    check_number("fade_power", fade_power, 0, 100, exclusive=True)  # draws take as many trials
 
 
 def _is_uniform(fade_factor: float | None) -> bool:
@@ -59,7 +59,7 @@ def draw_faded_ages(size: int, n_draws: int, fade_factor: float | None, fade_pow
     :param size: number n of stored transitions, at least 1
     :param n_draws: number of indices to draw
     :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
-    :param fade_power: power of the normalised age index, > 0
+    :param fade_power: power of the normalised age index, in (0, 100]
     :return: int array ``(n_draws,)`` of values in [0, size)
     """
     if fade_factor is None or _is_uniform(fade_factor):
@@ -225,7 +225,7 @@ class FadingReplayBuffer(FadedSampling, _StepsReplayBuffer):
     :param n_steps: horizon of the returns; 1 gives SB3's plain samples, more adds ``discounts`` to them
     :param gamma: discount factor of the n-step returns (unused if ``n_steps`` is 1)
     :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
-    :param fade_power: power of the normalised age index, > 0
+    :param fade_power: power of the normalised age index, in (0, 100]
     :param mirror: the robot's left-right symmetry, see :class:`~sb3_symphony.common.mirror.Mirror`; about every second
         transition is shown mirrored. Not with normalised observations. ``None``: transitions as they are
     :param start_share: about this part of the draws comes from the first steps of episodes alone, in [0, 1]. Who walks well
@@ -319,7 +319,7 @@ class FadingDictReplayBuffer(FadedSampling, DictReplayBuffer):
     :param n_steps: must be 1
     :param gamma: unused, accepted so that both fading buffers take the same arguments
     :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
-    :param fade_power: power of the normalised age index, > 0
+    :param fade_power: power of the normalised age index, in (0, 100]
     :raises ValueError: for a value outside the ranges above, or ``optimize_memory_usage=True``
     """
 

@@ -125,22 +125,36 @@ def bench(options: BenchOptions) -> BenchResult:
         raise ConfigError(f"-f: '{folder}' cannot be read — {error.strerror}") from None
     if options.dry_run:
         from sb3_symphony.experiment.grid_view import plain_table
+        from sb3_symphony.experiment.output import check_folder
 
+        check_folder(folder, "-f")
         _check_models([each for each in progress if not each.kept])
         _check_searches(study, progress, path, folder)
         return BenchResult(folder, plain_table(progress), untouched=True)
     if options.report:
-        from sb3_symphony.experiment.output import output_folder, write_output
-
-        if not any(each.run.path.is_dir() for each in progress) and not (folder / "sweeps").is_dir():
-            raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
-        table = report(study, progress, folder)
-        if options.page is not None:
-            write_output(Path(options.page), on_page(options.page, table).encode(), "--page")
-        if options.collect is not None:
-            collect(study, progress, folder, output_folder(Path(options.collect).absolute(), "--collect"))
-        return BenchResult(folder, table)
+        return _report(options, study, progress, folder)
     return _run(options, study, progress, folder, path)
+
+
+def _report(options: BenchOptions, study: Study, progress: Sequence[Progress], folder: Path) -> BenchResult:
+    """Write tables and figures, once all that is to be written can be."""
+    from sb3_symphony.experiment.output import output_file, output_folder, write_output
+
+    if not any(each.run.path.is_dir() for each in progress) and not (folder / "sweeps").is_dir():
+        raise ConfigError(f"--report: no results in '{folder}' — expected those of an earlier run, or -f")
+    target = None if options.collect is None else Path(options.collect).absolute()
+    if target is not None and target.resolve() == folder.resolve():
+        raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
+    if options.page is not None:
+        output_file(options.page, "--page")
+    if target is not None:
+        output_folder(target, "--collect")
+    table = report(study, progress, folder)
+    if options.page is not None:
+        write_output(Path(options.page), on_page(options.page, table).encode(), "--page")
+    if target is not None:
+        collect(study, progress, folder, target)
+    return BenchResult(folder, table)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -104,7 +104,12 @@ def _check_searches(study: Study, beside: Path, folder: Path) -> None:
         if found_by(study, name, folder).is_file() and plan.is_file():
             from sb3_symphony.experiment.tune import Plan  # Optuna takes a second
 
-            searched = json.loads(plan.read_text(encoding="utf-8"))
+            try:
+                searched = json.loads(plan.read_text(encoding="utf-8"))
+                if not isinstance(searched, dict):
+                    raise ValueError("expected a mapping")
+            except (OSError, ValueError) as error:
+                raise ConfigError(f"'{plan}' is damaged — {error}") from None
             Plan.read(options).check_same(searched, f"the search '{name}' in '{options.folder}'")
 
 

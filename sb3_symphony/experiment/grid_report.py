@@ -35,12 +35,10 @@ def collect(study: Study, progress: Sequence[Progress], folder: Path, target: Pa
     :param progress: all cells of the study
     :param folder: where their run folders are
     :param target: where the copies go
-    :raises ConfigError: if that is the same folder, or cannot be written
+    :raises ConfigError: if it cannot be written
     """
     from sb3_symphony.analysis.tables import scalar_table
 
-    if target.resolve() == folder.resolve():
-        raise ConfigError(f"--collect: '{target}' — expected another folder than that of the results")
     found = [path for each in progress for pattern in _RAW for path in each.run.path.glob(pattern)]
     of_models = [f"{name}.*" for name, figure in study.figures.items() if figure.gait_at is not None]
     found += [path for pattern in (*_RAW_BESIDE, *of_models) for path in folder.glob(pattern)]
@@ -80,7 +78,8 @@ def _run_of(progress: Progress) -> "Run | None":
     return open_run(progress.run.path) if (progress.run.details / "args.yml").is_file() else None
 
 
-_PAGE = re.compile(r"(?<=<!-- results -->\n).*?(?=<!-- /results -->)", re.DOTALL)
+_MARKS = ("<!-- results -->", "<!-- /results -->")
+_PAGE = re.compile(rf"({_MARKS[0]}(\r?\n)).*({_MARKS[1]})", re.DOTALL)
 
 
 def on_page(name: str, table: str) -> str:
@@ -93,12 +92,12 @@ def on_page(name: str, table: str) -> str:
     :raises ConfigError: if it cannot be read or has no such marks
     """
     try:
-        page = Path(name).read_text(encoding="utf-8")
+        page = Path(name).read_bytes().decode()  # with its own ends of lines
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"--page: '{name}' cannot be read — {error}") from None
-    if len(_PAGE.findall(page)) != 1:
-        raise ConfigError(f"--page: '{name}' — expected one line '<!-- results -->' and, further down, '<!-- /results -->'")
-    return _PAGE.sub(lambda _: f"\n{table}\n", page)
+    if _PAGE.search(page) is None or any(page.count(mark) != 1 for mark in _MARKS):
+        raise ConfigError(f"--page: '{name}' — expected one line '{_MARKS[0]}' and, further down, one '{_MARKS[1]}'")
+    return _PAGE.sub(lambda found: found[1] + f"\n{table}\n".replace("\n", found[2]) + found[3], page)
 
 
 def report(study: Study, progress: Sequence[Progress], folder: Path) -> str:

@@ -63,7 +63,7 @@ class TuneOptions(BaseModel):
     sampler: Literal["tpe", "random", "gp", "cmaes"] = "tpe"
     pruner: Literal["median", "halving", "hyperband", "none"] = "median"
     storage: str | None = Field(default=None, min_length=1)
-    study_name: str | None = Field(default=None, min_length=1, max_length=200)
+    study_name: str | None = Field(default=None, min_length=1)
     heartbeat: int = Field(default=30, ge=1)
     device: str = "auto"
     num_threads: Threads = -1
@@ -74,6 +74,8 @@ class TuneOptions(BaseModel):
     def _names_a_folder(cls, value: str | None) -> str | None:
         if value is not None and (value in (".", "..") or "/" in value):
             raise ValueError("expected a name, of a folder, too: without '/'")
+        if value is not None and len(value.encode(errors="surrogateescape")) > 200:
+            raise ValueError("expected at most 200 bytes: it is the name of a folder, too")
         return value
 
     @property
@@ -256,6 +258,8 @@ def _interval(where: str, spec: dict[str, Any]) -> Interval:
     if not isinstance(bounds, list) or len(bounds) != 2 or not all(_is_number(number, kind) for number in numbers):
         raise ConfigError(f"{where}: {spec} — expected {'whole ' if kind == 'int' else ''}numbers, {{{kind}: [low, high]}}")
     low, high, *rest = (int(number) if kind == "int" else float(number) for number in numbers)
+    if kind == "int" and max(abs(low), abs(high)) >= 2**63:
+        raise ConfigError(f"{where}: {spec} — expected numbers of at most 63 bits")
     step, log = (rest[0] if rest else None), spec.get("log", False)
     if not isinstance(log, bool):
         raise ConfigError(f"{where}: log: {log!r} — expected true or false")
@@ -345,4 +349,6 @@ def parse_space(content: Any, where: str) -> SearchSpace:
                 fixed[name] = choice.values[0]
         else:
             raise ConfigError(f"{where}: {name}: {spec!r} — expected [choice, …], {{float: [low, high]}} or {{int: …}}")
+        if _covered(name, [other for other in content if other != name]):
+            raise ConfigError(f"{where}: {name} — expected it or its items, not both")
     return SearchSpace(where, parameters, fixed)

@@ -70,7 +70,7 @@ def _some(value: Any) -> Any:
 
 _Item = TypeVar("_Item")
 _List = Annotated[list[_Item], BeforeValidator(_some)]
-_Seeds = Annotated[_List[Annotated[int, Field(ge=0, lt=2**31)]], BeforeValidator(_seeds)]
+_Seeds = Annotated[_List[Annotated[Whole, Field(lt=2**31)]], BeforeValidator(_seeds)]
 
 
 def _overrides(value: Any) -> Any:

@@ -7,6 +7,7 @@ are back, or patience has run out. Both tell the trials of processes that live f
 
 import json
 import os
+import re
 import socket
 import threading
 import time
@@ -424,6 +425,6 @@ def open_storage(where: str, stopping: Callable[[], None], heartbeat: int) -> Sw
     :return: the storage
     :raises ConfigError: if there is none
     """
-    if "://" in where:
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", where):  # a letter alone is a drive of Windows
         return PostgresSweep(where, stopping, heartbeat)
     return JournalSweep(Path(where), stopping, heartbeat)
