@@ -127,6 +127,7 @@ def test_entry_of_the_environment_comes_before_the_default(tmp_path):
         ("tau: 0.1", r"tau: 0.1 — expected \[choice, …\]"),
         ("default: {}", "space.yml: default: {} — expected a mapping"),
         ("- tau", "expected a mapping"),
+        ("default:\n  1: [0.1, 0.2]\n  tau: [0.1, 0.2]", "expected a mapping of hyper-parameters to choices"),
         ("gamma: [0.9]\ndefault:\n  tau: [0.1, 0.2]", "'gamma' stands beside the entry 'default' — expected inside it"),
         ("Hopper-v5:\n  gamma: [0.9, 0.99]", "space.yml: no entry for 'BipedalWalker-v3'$"),
         ("BipedalWalker-v2:\n  gamma: [0.9]", "no entry for 'BipedalWalker-v3': did you mean 'BipedalWalker-v2'"),

@@ -334,7 +334,7 @@ def parse_space(content: Any, where: str) -> SearchSpace:
     :return: the space
     :raises ConfigError: if one of its ranges is wrong
     """
-    if not isinstance(content, dict) or not content:
+    if not isinstance(content, dict) or not content or not all(isinstance(name, str) for name in content):
         raise ConfigError(f"{where}: {content!r} — expected a mapping of hyper-parameters to choices or ranges")
     parameters: dict[str, Interval | Choice] = {}
     fixed: dict[str, Any] = {}
