@@ -519,8 +519,9 @@ def load_config(options: TrainOptions, inherited: Mapping[str, Any] | None = Non
     """
     check_algorithm(options.algo)
     _, entry = find_entry(options)
-    others = {key: value for key, value in entry.items() if key not in (inherited or {})}
-    return merge({**others, **{key: value for key, value in (inherited or {}).items() if value is not None}}, options)
+    inherited = inherited or {}
+    plain = {key: value for key, value in {**entry, **inherited}.items() if value is not None or key not in inherited}
+    return merge(plain, options)
 
 
 #: what settles the networks of an agent and what they are given

@@ -331,6 +331,7 @@ def check_folders(options: TrainOptions, folder: Path | None = None, begins: boo
         check_folder(options.log_folder if folder is None else folder.parent, "--log-folder")
     if options.tensorboard_log:
         check_folder(options.tensorboard_log, "--tensorboard-log")
+        # A given run folder holds its own log, which is the only one there
         if begins and folder is None and glob.escape(options.tensorboard_log) != options.tensorboard_log:
             raise ConfigError(
                 f"--tensorboard-log: '{options.tensorboard_log}' — expected a path without *, ? and [, in which SB3 would not "
