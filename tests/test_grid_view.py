@@ -84,9 +84,16 @@ def test_lines_where_there_is_no_terminal(cells, clock, capsys):
             "running sac/Pendulum-v1_1 | step 400 / 1000 | return -1234.6 | 0:02:00 left | "
             "1 running, 1 queued, 1 done; about 0:05:20 left"  # 300 steps took 60 s, 600 + 1000 are left
         ]
-        clock(1000)
+        clock(599)
         cells[1].steps = 499
         assert told() == []  # less than a tenth further
+        clock(1)
+        assert told() == [
+            "running sac/Pendulum-v1_1 | step 499 / 1000 | return -1234.6 | 0:13:49 left | "
+            "1 running, 1 queued, 1 done; about 0:41:23 left"
+        ]
+        clock(1000)
+        assert told() == []  # no further
         assert told(stopping=True) == ["saving and stopping (Ctrl-C again: at once)"] and told(stopping=True) == []
 
         cells[1].state, cells[1].reason = "failed", "RuntimeError: the motor is hot"

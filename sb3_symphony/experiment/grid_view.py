@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 _COLUMNS = ("cell", "state", "step", "return", "time left")
 _STYLES = {"running": "bold", "failed": "red", "queued": "dim", "stopped": "yellow", "done": "green"}
 _STOPPING = "saving and stopping (Ctrl-C again: at once)"
-#: without a terminal, how far a cell is is told after this share of its steps, and so many seconds, at least
-_SHARE, _SECONDS = 0.1, 60.0
+#: without a terminal, how far a cell is is told after this share of its steps and so many seconds at least, and after so many
+#: at most: a tenth may take hours
+_SHARE, _SECONDS, _MOST_SECONDS = 0.1, 60.0, 600.0
 
 
 def _time(seconds: float | None) -> str:
@@ -89,7 +90,8 @@ class View:
         now = time.monotonic()
         for each in self.progress:
             state, steps, moment = self.told[each.cell.name]
-            if each.state != state or (each.steps >= steps + _SHARE * each.total and now >= moment + _SECONDS):
+            wait = _SECONDS if each.steps >= steps + _SHARE * each.total else _MOST_SECONDS
+            if each.state != state or (each.steps > steps and now >= moment + wait):
                 self.told[each.cell.name] = (each.state, each.steps, now)
                 print(self._line(each), flush=True)
 
