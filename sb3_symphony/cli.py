@@ -212,7 +212,7 @@ def _add_train(commands: Any) -> None:
     add("--resume", metavar="RUN_FOLDER", help="go on with a run from its newest checkpoint")
     add("--device", help=f"auto, cpu or cuda (default: {default.device})")
     add("--num-threads", type=_whole_number, metavar="N", help="threads of PyTorch (default: PyTorch's)")
-    add("--log-interval", type=_whole_number, metavar="N", help="episodes between log lines, -1: default, -2: none")
+    add("--log-interval", type=_whole_number, metavar="N", help="episodes (or rollouts) between log lines, -1: default")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (default: in a terminal)")
     add("--verbose", type=int, choices=(0, 1, 2), help="log to the terminal (default: 1, with a progress bar 0)")
     add("--quiet", action="store_true", help="print nothing but errors and notes")

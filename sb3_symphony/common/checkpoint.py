@@ -184,7 +184,7 @@ def checkpoint_files(folder: Path) -> dict[int, Path]:
     return {int(match[1]): path for match, path in found if match}
 
 
-def newest_checkpoint(folder: Path) -> Checkpoint | None:
+def newest_checkpoint(folder: str | Path) -> Checkpoint | None:
     """
     Find the newest checkpoint whose files are whole. Nothing is changed.
 
@@ -192,7 +192,7 @@ def newest_checkpoint(folder: Path) -> Checkpoint | None:
     :return: the checkpoint, or None if there was never one
     :raises DamagedFile: if there are checkpoints, but none is whole
     """
-    damaged: list[str] = []
+    folder, damaged = Path(folder), list[str]()
     for steps, path in sorted(checkpoint_files(folder).items(), reverse=True):
         try:
             state = unseal(path)
