@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, ValidationError
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.common.plain_yaml import PlainLoader
@@ -195,10 +195,8 @@ NotZero = AfterValidator(_not_zero)
 Threads = Annotated[int, Field(ge=-1, le=1024)]
 
 
-class TrainOptions(BaseModel):
+class TrainOptions(BaseModel, extra="forbid", frozen=True):
     """Options of ``sb3-symphony train``; their meaning is in its ``--help``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     algo: str = "symphony"
     env: str = "BipedalWalker-v3"
@@ -269,7 +267,7 @@ Count = Annotated[int, BeforeValidator(_no_boolean), Field(ge=1)]
 Whole = Annotated[int, BeforeValidator(_no_boolean), Field(ge=0)]
 
 
-class RunSettings(BaseModel):
+class RunSettings(BaseModel, extra="forbid"):
     """
     Keys of a configuration that are about the run; all others belong to the algorithm's constructor.
 
@@ -286,8 +284,6 @@ class RunSettings(BaseModel):
     :param noise_std: its standard deviation, in scaled action units
     :param stop_reward: mean return of an evaluation that ends the training
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     n_timesteps: Count
     policy: str = "MlpPolicy"

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from uuid import uuid4
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from sb3_symphony.common.checks import last_line
 from sb3_symphony.common.files import write_atomically
@@ -46,10 +46,8 @@ if TYPE_CHECKING:  # the command line imports this module before it knows what i
 _BEAT = 10.0
 
 
-class BenchOptions(BaseModel):
+class BenchOptions(BaseModel, extra="forbid", frozen=True):
     """Options of ``sb3-symphony bench``; their meaning is in its ``--help``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     study: str
     quick: bool = False

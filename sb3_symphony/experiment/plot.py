@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import ConfigError
@@ -24,10 +24,8 @@ class NothingToDraw(ConfigError):
     """No run has recorded what is asked for."""
 
 
-class PlotOptions(BaseModel):
+class PlotOptions(BaseModel, extra="forbid", frozen=True):
     """Options of ``sb3-symphony plot``; their meaning is in its ``--help``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     runs: list[str] = []
     algo: list[str] = []

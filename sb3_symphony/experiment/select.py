@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import (
@@ -31,7 +31,7 @@ from sb3_symphony.experiment.run_folder import RunFolder, steps_in_name
 _DEFAULT_ALGO, _DEFAULT_ENV = TrainOptions().algo, TrainOptions().env
 
 
-class SelectOptions(BaseModel):
+class SelectOptions(BaseModel, extra="forbid", frozen=True):
     """
     Flags that say which agent, in which environment.
 
@@ -50,8 +50,6 @@ class SelectOptions(BaseModel):
     :param device: where the networks run
     :param num_threads: threads of PyTorch, -1: its own choice
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: str | None = None
     algo: str | None = None
@@ -294,7 +292,7 @@ def _model_of(run: RunFolder, options: SelectOptions) -> Path:
 # ----------------------------------------------------------------------------------------------------------------------
 
 
-class EvaluateOptions(SelectOptions):
+class EvaluateOptions(SelectOptions, frozen=True):
     """Options of ``sb3-symphony evaluate``; their meaning is in its ``--help``."""
 
     n_episodes: int = Field(default=100, ge=1, lt=2**31)
@@ -308,7 +306,7 @@ class EvaluateOptions(SelectOptions):
     num_threads: Threads = 1  # one observation at a time is fastest so, and results do not depend on the machine's cores
 
 
-class EnjoyOptions(SelectOptions):
+class EnjoyOptions(SelectOptions, frozen=True):
     """Options of ``sb3-symphony enjoy``; their meaning is in its ``--help``."""
 
     n_timesteps: int = Field(default=1000, ge=1)
@@ -321,13 +319,13 @@ class EnjoyOptions(SelectOptions):
     progress: bool = False
 
 
-class ExportOptions(SelectOptions):
+class ExportOptions(SelectOptions, frozen=True):
     """Options of ``sb3-symphony export``; their meaning is in its ``--help``."""
 
     output: str | None = Field(default=None, min_length=1)
 
 
-class AgentsOptions(SelectOptions):
+class AgentsOptions(SelectOptions, frozen=True):
     """
     Flags of commands that show one agent or several.
 
@@ -350,7 +348,7 @@ class AgentsOptions(SelectOptions):
     num_threads: Threads = 1
 
 
-class VideoOptions(AgentsOptions):
+class VideoOptions(AgentsOptions, frozen=True):
     """Options of ``sb3-symphony video``; their meaning is in its ``--help``."""
 
     grid: bool = False
@@ -359,7 +357,7 @@ class VideoOptions(AgentsOptions):
     width: int | None = Field(default=None, ge=64, le=3840)
 
 
-class GaitOptions(AgentsOptions):
+class GaitOptions(AgentsOptions, frozen=True):
     """Options of ``sb3-symphony gait``; their meaning is in its ``--help``."""
 
     skip: FiniteFloat = Field(default=2.0, ge=0, le=1e6)

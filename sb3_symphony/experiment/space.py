@@ -19,7 +19,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, Field, field_validator
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import (
@@ -39,10 +39,8 @@ if TYPE_CHECKING:
     from optuna import Trial
 
 
-class TuneOptions(BaseModel):
+class TuneOptions(BaseModel, extra="forbid", frozen=True):
     """Options of ``sb3-symphony tune``; their meaning is in its ``--help``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     algo: str = "symphony"
     env: str = "BipedalWalker-v3"

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, FiniteFloat, field_validator, model_validator
 
 from sb3_symphony.common.checks import suggestion
 from sb3_symphony.experiment.config import (
@@ -87,7 +87,7 @@ def _check_name(value: str) -> None:
         raise ValueError("expected letters, digits and . _ + - (it names a folder)")
 
 
-class Start(BaseModel):
+class Start(BaseModel, extra="forbid", frozen=True):
     """
     Where an algorithm takes its agents from: the networks at the end of another cell of the study, of the same seed.
 
@@ -96,14 +96,12 @@ class Start(BaseModel):
     :param replay_buffer: whether the experience is taken over too
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     algorithm: str
     environment: str
     replay_buffer: bool = False
 
 
-class Algorithm(BaseModel):
+class Algorithm(BaseModel, extra="forbid", frozen=True):
     """
     A variant: an algorithm with its settings.
 
@@ -118,8 +116,6 @@ class Algorithm(BaseModel):
     :param start_from: agents that it starts from, by default new ones
     :param reported: what others have reported of it, for a column of the table; a text, or a mapping of environments to texts
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     algo: str = ""
@@ -147,7 +143,7 @@ class Algorithm(BaseModel):
         return self
 
 
-class Environment(BaseModel):
+class Environment(BaseModel, extra="forbid", frozen=True):
     """
     An environment of a study.
 
@@ -159,8 +155,6 @@ class Environment(BaseModel):
     :param steps: environment steps, which go before those of the study
     :param overrides: hyper-parameters that go before those of a file, but not before an algorithm's own
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: str
     env_kwargs: dict[str, Any] = {}
@@ -176,15 +170,13 @@ class Environment(BaseModel):
         return self
 
 
-class Protocol(BaseModel):
+class Protocol(BaseModel, extra="forbid", frozen=True):
     """
     An evaluation protocol of a study's own.
 
     :param eval_freq: environment steps between evaluations, 0: none
     :param eval_episodes: episodes of each
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     eval_freq: Whole = 10_000
     eval_episodes: Count = 10
@@ -201,7 +193,7 @@ def _protocol(value: Any) -> Any:
 _AnyProtocol = Annotated[Any, BeforeValidator(_protocol)]  # "standard" or Protocol
 
 
-class Condition(BaseModel):
+class Condition(BaseModel, extra="forbid", frozen=True):
     """
     What is different when final models are evaluated once more.
 
@@ -210,8 +202,6 @@ class Condition(BaseModel):
     :param obs_noise: standard deviation of noise on observations
     :param action_delay: steps from an action to its effect
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     env_kwargs: dict[str, Any] = {}
     env_wrapper: NamedList = []
@@ -226,7 +216,7 @@ def _conditions(value: Any) -> Any:
     return {str(name): _part(Condition, None, condition) for name, condition in value.items()}
 
 
-class Matrix(BaseModel):
+class Matrix(BaseModel, extra="forbid", frozen=True):
     """
     Evaluation of all final models under conditions of which each may have been trained under one.
 
@@ -234,13 +224,11 @@ class Matrix(BaseModel):
     :param conditions: name → what is different; names that are numbers are drawn as such
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     label: str
     conditions: Annotated[dict[str, Condition], BeforeValidator(_conditions)]
 
 
-class Quick(BaseModel):
+class Quick(BaseModel, extra="forbid", frozen=True):
     """
     What differs in the version of a few minutes.
 
@@ -250,8 +238,6 @@ class Quick(BaseModel):
     :param sweeps: options for all searches, which go before their own
     :param seeds: see :class:`Study`, as all others; steps and seeds go before those of algorithms and environments too
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     algorithms: _List[str] | None = None
     environments: _List[str] | None = None
@@ -317,7 +303,7 @@ def _figure(options: Any) -> "Drawing":
     return drawing
 
 
-class Drawing(PlotOptions):
+class Drawing(PlotOptions, frozen=True):
     """
     A figure of a study: options of ``plot``, and which of its runs.
 
@@ -336,7 +322,7 @@ class Drawing(PlotOptions):
         return algorithm in (self.algorithms or [algorithm]) and environment in (self.environments or [environment])
 
 
-class Study(BaseModel):
+class Study(BaseModel, extra="forbid", frozen=True):
     """
     A study.
 
@@ -355,8 +341,6 @@ class Study(BaseModel):
     :param tensorboard: whether runs log what figures of scalars draw
     :param quick: the version of a few minutes
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     title: str = ""
     algorithms: _List[Annotated[Algorithm, BeforeValidator(partial(_part, Algorithm, "name"))]]
