@@ -692,7 +692,7 @@ def test_evaluations_survive_a_full_disk(monkeypatch):
     (run,) = [path for path in (os.scandir("logs/td3"))]
     with np.load(os.path.join(run.path, "evaluations.npz")) as data:
         assert data["timesteps"].tolist() == [60]
-    assert ".evaluations.tmp.npz" not in os.listdir(run.path)
+    assert not [name for name in os.listdir(run.path) if name.startswith(".evaluations")]
 
 
 def test_a_disk_that_is_full_from_the_beginning(monkeypatch):

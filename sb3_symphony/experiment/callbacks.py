@@ -5,7 +5,7 @@ import os
 import pickle
 import warnings
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.statistics import first_stable_evaluation
-from sb3_symphony.common.files import write_atomically
+from sb3_symphony.common.files import completed, write_atomically
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.decode import argument_types, class_by_name, typed_arguments
 from sb3_symphony.experiment.signals import handled_by
@@ -139,6 +139,8 @@ class SeededEvaluation(EvalCallback):
     :param kwargs: arguments of ``EvalCallback``
     """
 
+    log_path: Any  # where SB3 writes them meanwhile
+
     def __init__(
         self,
         eval_env: VecEnv,
@@ -150,8 +152,7 @@ class SeededEvaluation(EvalCallback):
         **kwargs: Any,
     ) -> None:
         super().__init__(eval_env, **kwargs)
-        # SB3 makes the folder that is written before the name, so there has to be one, if only "."
-        self.log_path = None if log_path is None else os.path.join(log_path, ".evaluations.tmp.npz")
+        self.evaluations_file = None if log_path is None else log_path / "evaluations.npz"
         self.stop_reward = stop_reward
         self.stop = stop
         self.threshold = threshold
@@ -176,16 +177,12 @@ class SeededEvaluation(EvalCallback):
         if between or (n_due % self.solved_stride and self._solved()):
             return True
         self.eval_env.env_method("restart_seeds")
+        file = self.evaluations_file
         try:
-            go_on = super()._on_step()
+            with nullcontext() if file is None else completed(file) as self.log_path:
+                go_on = super()._on_step()
         except _EvaluationAborted:
             return False
-        except BaseException:
-            if self.log_path is not None:
-                Path(self.log_path).unlink(missing_ok=True)
-            raise
-        if self.log_path is not None:
-            os.replace(self.log_path, Path(self.log_path).with_name("evaluations.npz"))
         return go_on and not (self.stop_reward is not None and self.last_mean_reward >= self.stop_reward)
 
 
