@@ -82,14 +82,9 @@ class BenchResult:
 
     def summary(self) -> str:
         """:return: table, and where all is, for the end of the command"""
-        if self.untouched:
-            return self.table
-        lines = [self.table]
-        if self.interrupted:
-            lines.append(f"interrupted, saved in {self.folder} — the same command goes on")
-        else:
-            lines.append(f"results in {self.folder}")
-        return "\n".join(lines)
+        saved = f"interrupted, saved in {self.folder} — the same command goes on"
+        end = saved if self.interrupted else f"results in {self.folder}"
+        return self.table if self.untouched else f"{self.table}\n{end}"
 
 
 def bench(options: BenchOptions) -> BenchResult:

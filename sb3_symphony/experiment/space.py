@@ -160,6 +160,14 @@ class Interval:
         return {kind: [self.low, self.high], "log": self.log, "step": self.step}
 
 
+def scalar(value: Any) -> Any:
+    """
+    :param value: any plain value
+    :return: what Optuna and tables, which want scalars, know it as: lists and mappings by their JSON text
+    """
+    return json.dumps(value) if isinstance(value, list | dict) else value
+
+
 @dataclass(frozen=True)
 class Choice:
     """
@@ -170,25 +178,20 @@ class Choice:
 
     values: tuple[Any, ...]
 
-    @staticmethod
-    def _label(value: Any) -> Any:
-        """Optuna wants scalars; lists and mappings are known by their JSON text."""
-        return json.dumps(value) if isinstance(value, list | dict) else value
-
     def suggest(self, name: str, trial: "Trial") -> Any:
         """
         :param name: name of the parameter
         :param trial: trial that a value is wanted for
         :return: the value
         """
-        return self.value(trial.suggest_categorical(name, [self._label(value) for value in self.values]))
+        return self.value(trial.suggest_categorical(name, [scalar(value) for value in self.values]))
 
     def value(self, stored: Any) -> Any:
         """
         :param stored: what the study knows the value as
         :return: the value
         """
-        return next(value for value in self.values if self._label(value) == stored)
+        return next(value for value in self.values if scalar(value) == stored)
 
     def examples(self) -> list[Any]:
         """:return: values that show whether all are allowed"""

@@ -185,7 +185,7 @@ class Protocol(BaseModel, extra="forbid", frozen=True):
 def _protocol(value: Any) -> Any:
     if value == "standard":
         return value
-    if isinstance(value, str) or not isinstance(value, dict):
+    if not isinstance(value, dict):
         raise ConfigError(f"{value!r} — expected standard, or a mapping of eval_freq and eval_episodes")
     return validated(Protocol, value)
 

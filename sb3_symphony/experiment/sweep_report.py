@@ -19,7 +19,7 @@ from sb3_symphony.analysis.tables import aligned, as_csv
 from sb3_symphony.common.files import write_atomically
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge, told
 from sb3_symphony.experiment.output import columns
-from sb3_symphony.experiment.space import parse_space
+from sb3_symphony.experiment.space import parse_space, scalar
 from sb3_symphony.experiment.sweep_storage import WORKER
 
 #: attribute of a study: what all its trials have in common
@@ -135,7 +135,7 @@ class SweepReport:
                 "worker": trial.user_attrs.get(WORKER),
             }
             row |= dict(zip((f"seed_{seed}" for seed in self.plan["seeds"]), returns, strict=False))
-            rows.append({**row, **{name: _cell(value) for name, value in self.space.values(trial.params).items()}})
+            rows.append({**row, **{name: scalar(value) for name, value in self.space.values(trial.params).items()}})
         names = list(dict.fromkeys(name for row in rows for name in row))
         return [{name: row.get(name) for name in names} for row in rows]
 
@@ -222,10 +222,6 @@ class SweepReport:
         table += [[str(t.number), f"{t.value:.2f}", *map(parameters_of(t).__getitem__, names)] for t in best[:_N_BEST]]
         lines += columns(table, left=0)
         return "\n".join([*lines, f"best: trial {best[0].number}, {best[0].value:.2f} | {self.folder / 'best.yml'}"])
-
-
-def _cell(value: Any) -> Any:
-    return json.dumps(value) if isinstance(value, list | dict) else value
 
 
 def trials_table(name: str, path: Path, n_trials: int) -> str:
