@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
 
-from sb3_symphony.common.files import write_atomically
+from sb3_symphony.common.files import completed, write_atomically
 from sb3_symphony.common.versions import package_versions, processor
 from sb3_symphony.experiment.config import ConfigError, TrainOptions
 from sb3_symphony.experiment.run_folder import RunFolder, saved_count
@@ -56,9 +56,8 @@ class Control:
         :param stop: 0: go on; 1: save and stop; 2: stop at once; 3: end without saving
         """
         self.beats += 1
-        temporary = self.path.with_name(f".{self.path.name}.tmp")
-        temporary.write_text(json.dumps({"beat": self.beats, "stop": stop}), encoding="utf-8")
-        temporary.replace(self.path)
+        with completed(self.path) as unfinished:
+            unfinished.write_text(json.dumps({"beat": self.beats, "stop": stop}), encoding="utf-8")
 
     def heard(self) -> dict[str, int] | None:
         """:return: ``beat`` and ``stop``; None if the file cannot be read just now"""

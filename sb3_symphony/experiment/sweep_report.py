@@ -1,7 +1,6 @@
 """What a study has found: a table of its trials, the best configuration, and Optuna's figures."""
 
 import csv
-import io
 import json
 import re
 import shlex
@@ -16,7 +15,7 @@ import yaml
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_symphony.analysis.tables import aligned, as_csv
-from sb3_symphony.common.files import write_atomically
+from sb3_symphony.common.files import completed, write_atomically
 from sb3_symphony.experiment.config import ConfigError, TrainOptions, merge, told
 from sb3_symphony.experiment.output import columns
 from sb3_symphony.experiment.space import parse_space, scalar
@@ -196,18 +195,17 @@ class SweepReport:
                 warnings.simplefilter("ignore")  # of axes with a single value, and that the module is experimental
                 axes = getattr(drawings, f"plot_{name}")(self.study)
                 figure = np.ravel(axes)[0].get_figure()
-                image = io.BytesIO()
-                figure.savefig(image, dpi=120, bbox_inches="tight")
+                with completed(self.folder / f"{name}.png") as unfinished:
+                    figure.savefig(unfinished, dpi=120, bbox_inches="tight")
                 plt.close(figure)
-            write_atomically(self.folder / f"{name}.png", image.getvalue())
 
     def summary(self) -> str:
         """:return: state, best trials and where the files are, for the terminal"""
         trials = self.study.get_trials(deepcopy=False)
         again = replaced(trials)
         states = _counted([trial.state.name.lower() for trial in trials]) or "none"
-        lines = [f"{self.study.study_name}: {len(trials)} trials ({states}; {len(again)} of them tried again)"]
-        lines[0] = lines[0] if again else lines[0].replace("; 0 of them tried again", "")
+        repeated = f"; {len(again)} of them tried again" if again else ""
+        lines = [f"{self.study.study_name}: {len(trials)} trials ({states}{repeated})"]
         reasons = Counter(reason_of(trial) for trial in trials if trial.state == TrialState.FAIL)
         lines += [f"  failed {count} ×: {reason}" for reason, count in reasons.most_common(5)]
         for trial in trials:
