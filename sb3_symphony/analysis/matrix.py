@@ -12,10 +12,10 @@ from sb3_symphony.analysis.style import house_style, line_style, name_lines, new
 from sb3_symphony.analysis.tables import Result, Row, aligned, by_algorithm
 
 
-def _returns(result: Result, name: str) -> np.ndarray | None:
-    """Returns under a condition, shape ``(n,)``."""
-    values = (result.summary or {}).get("conditions", {}).get(name, {}).get("returns")
-    return np.array(values, dtype=np.float64) if values else None
+def _conditions(result: Result) -> dict[str, np.ndarray]:
+    """Returns under each condition that it was evaluated under, shape ``(n,)``."""
+    evaluated = (result.summary or {}).get("conditions", {})
+    return {name: np.array(each["returns"], dtype=np.float64) for name, each in evaluated.items()}
 
 
 def matrix_rows(results: Sequence[Result]) -> list[Row]:
@@ -25,9 +25,7 @@ def matrix_rows(results: Sequence[Result]) -> list[Row]:
     """
     rows: list[Row] = []
     for each in results:
-        for name in (each.summary or {}).get("conditions", {}):
-            returns = _returns(each, name)
-            assert returns is not None
+        for name, returns in _conditions(each).items():
             summary = summarise(returns)
             rows.append(
                 {
@@ -40,7 +38,7 @@ def matrix_rows(results: Sequence[Result]) -> list[Row]:
 
 def _entries(results: Sequence[Result], name: str) -> np.ndarray | None:
     """Returns under a condition of all seeds, shape ``(seeds · episodes,)``."""
-    returns = [values for each in results if (values := _returns(each, name)) is not None]
+    returns = [own[name] for each in results if name in (own := _conditions(each))]
     return np.concatenate(returns) if returns else None
 
 

@@ -87,6 +87,10 @@ def draw_faded_ages(size: int, n_draws: int, fade_factor: float | None, fade_pow
 # ----------------------------------------------------------------------------------------------------------------------
 
 
+#: arrays ``(rows, n_envs, ...)``, or dicts of them, in which a row is written once, until the ring comes round
+STORAGE = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
 def _refuse_memory_optimisation(name: str, optimize_memory_usage: bool) -> None:
     if optimize_memory_usage:
         raise ValueError(
@@ -158,7 +162,7 @@ class _StepsReplayBuffer(NStepReplayBuffer):
         for index in np.unique(env_indices):
             view = copy.copy(self)
             view.n_envs = 1
-            for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
+            for name in STORAGE:
                 setattr(view, name, getattr(self, name)[:, index : index + 1])  # shares memory
             parts.append(view._get_samples(rows[env_indices == index], env=env))
         back = th.as_tensor(np.argsort(order), device=self.device)

@@ -8,11 +8,9 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_symphony.common.buffers import end_trajectory
+from sb3_symphony.common.buffers import STORAGE, end_trajectory
 from sb3_symphony.common.checks import constructor_parameters
 from sb3_symphony.common.files import seal, unseal
-
-_STORAGE = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 class Segment(NamedTuple):
@@ -25,8 +23,8 @@ class Segment(NamedTuple):
 
 
 def _storage(buffer: ReplayBuffer) -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays ``(rows, n_envs, ...)`` in which a row is written once, until the ring comes round."""
-    for name in _STORAGE:
+    """Its arrays with one row per step, by name."""
+    for name in STORAGE:
         value = getattr(buffer, name, None)
         if isinstance(value, dict):
             yield from ((f"{name}.{key}", array) for key, array in value.items())
@@ -165,7 +163,7 @@ def add_transitions(buffer: ReplayBuffer, parts: Iterable[dict[str, np.ndarray]]
 
 
 _MAY_CHANGE = {"beta"}  # of PrioritizedReplayBuffer: arguments that callbacks set while training
-_NOT_BUFFER_STATE = {*_STORAGE, "env", "device", "observation_space", "action_space"}
+_NOT_BUFFER_STATE = {*STORAGE, "env", "device", "observation_space", "action_space"}
 
 
 def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:

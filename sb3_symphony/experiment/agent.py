@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -72,7 +71,7 @@ class Agent:
     def __enter__(self) -> "Agent":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.env.close()
 
     def episode(self, seed: int, deterministic: bool = True) -> Iterator[Step]:
