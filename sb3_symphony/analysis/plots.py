@@ -293,9 +293,9 @@ def plot_curves(panels: dict[str, list[Curve]], x: XAxis, y: YAxis, smoothed: st
         columns = min(len(panels), 2)
         rows = -(-len(panels) // columns)
         figure = new_figure(7.0 if columns == 1 else 5.2 * columns, 3.8 * rows if columns == 1 else 3.2 * rows)
-        grid = figure.subplots(rows, columns, squeeze=False)
         labels = list(dict.fromkeys(curve.label for curves in panels.values() for curve in curves))
-        for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
+        for number, (title, curves) in enumerate(panels.items(), 1):
+            axes = figure.add_subplot(rows, columns, number)
             _draw(axes, curves, labels)
             axes.set_title(title)
             axes.set_ylabel(_Y_LABELS[y])
@@ -303,10 +303,8 @@ def plot_curves(panels: dict[str, list[Curve]], x: XAxis, y: YAxis, smoothed: st
                 axes.set_ylim(0, 1.02)
                 axes.yaxis.set_major_formatter(PercentFormatter(1.0))
             _scale_x(axes, x)
-        for axes in grid.flat[len(panels) :]:
-            axes.remove()
         note(figure, _explained([curve for curves in panels.values() for curve in curves], smoothed))
-        for axes, curves in zip(grid.flat, panels.values(), strict=False):
+        for axes, curves in zip(figure.axes, panels.values(), strict=True):
             ends = [(_name(c), _end_value(c), line_style(labels.index(c.label))) for c in curves]
             name_lines(figure, axes, ends)
         return save(figure, output)
@@ -332,18 +330,16 @@ def plot_scalars(panels: dict[str, list[Curve]], x: XAxis, output: Path, title: 
         columns = min(len(panels), 3)
         rows = -(-len(panels) // columns)
         figure = new_figure(3.4 * columns, 2.2 * rows + 0.2)
-        grid = figure.subplots(rows, columns, squeeze=False)
         every = [curve for curves in panels.values() for curve in curves]
         names = {curve.label: _name(curve) for curve in every}
         labels = list(names)
-        for axes, (tag, curves) in zip(grid.flat, panels.items(), strict=False):
+        for number, (tag, curves) in enumerate(panels.items(), 1):
+            axes = figure.add_subplot(rows, columns, number)
             _draw(axes, curves, labels)
             name, unit = SCALARS.get(tag, (tag, ""))
             axes.set_title(name)
             axes.set_ylabel(unit)
             axes.margins(x=0.02)
-        for axes in grid.flat[len(panels) :]:
-            axes.remove()
         right = max(axes.get_xlim()[1] for axes in figure.axes)
         for number, axes in enumerate(figure.axes):
             _scale_x(axes, x, right)
