@@ -1,5 +1,4 @@
 import copy
-import inspect
 import pickle
 
 import cloudpickle
@@ -165,7 +164,6 @@ def test_second_moments_in_single_precision(beta2):
     assert sums[0] == pytest.approx(sums[1], rel=1e-5)
 
 
-@pytest.mark.skipif("decoupled_weight_decay" not in inspect.signature(th.optim.Adam).parameters, reason="an older torch")
 def test_decoupled_weight_decay_of_adam():
     assert_equal_runs(*pair(optimizer_kwargs=dict(weight_decay=0.5, decoupled_weight_decay=True)))
 

@@ -277,9 +277,9 @@ class FusedRegression(CriticRegression):
             self._prepare_sweeps(network)
             self._sweeps_known = True
         group = self.critic.optimizer.param_groups[0]
-        decoupled = group.get("decoupled_weight_decay", isinstance(self.critic.optimizer, th.optim.AdamW))
+        weight_decay = group["weight_decay"], group["decoupled_weight_decay"]
         for sweep in self._sweeps:
-            sweep(group["lr"], *group["betas"], group["eps"], group["weight_decay"], decoupled, tau)
+            sweep(group["lr"], *group["betas"], group["eps"], *weight_decay, tau)
 
     def _prepare_sweeps(self, network: FusedNetwork) -> None:
         """Over parameters and targets where they are, with states where torch's optimiser keeps them."""

@@ -28,7 +28,7 @@ from urllib.parse import quote
 
 from sb3_symphony.common.files import completed, write_atomically
 from sb3_symphony.common.versions import package_versions, processor
-from sb3_symphony.experiment.config import ConfigError, TrainOptions
+from sb3_symphony.experiment.config import ConfigError, TrainOptions, told
 from sb3_symphony.experiment.run_folder import RunFolder, saved_count
 from sb3_symphony.experiment.signals import ended_by
 
@@ -350,8 +350,7 @@ def main() -> int:
     except Exception as error:
         traceback.print_exc()
         sys.stderr.flush()
-        first_line = next(iter(str(error).splitlines()), "")
-        print(f"{type(error).__name__}: {first_line}" if first_line else type(error).__name__)
+        print(told(error).splitlines()[0])
     return _FAILED
 
 

@@ -6,8 +6,9 @@ from typing import Any
 
 import yaml
 
+from sb3_symphony.common.checks import constructor_parameters
 from sb3_symphony.experiment.config import ConfigError, RunConfig, RunSettings, TrainOptions, find_entry
-from sb3_symphony.experiment.decode import RESERVED, argument_types
+from sb3_symphony.experiment.decode import RESERVED
 from sb3_symphony.experiment.registry import load_algorithm
 from sb3_symphony.experiment.train import check_folders, effective_config, prepare
 from sb3_symphony.experiment.transfer import find_trained, inherited
@@ -64,15 +65,11 @@ def _defaults(algo: str, config: RunConfig) -> dict[str, tuple[Any, str]]:
         if name not in config.plain and not field.is_required():
             defaults[name] = (field.default, "default of train")
     parents = [parent for parent in algorithm.__mro__ if "__init__" in vars(parent)]
-    for name in argument_types(algorithm):
-        if name in RESERVED or name in config.plain or name in defaults:
-            continue
-        owner = next(parent for parent in parents if name in inspect.signature(parent).parameters)
-        default = inspect.signature(owner).parameters[name].default
-        if name == "action_noise" and config.settings.noise_type is not None:
-            continue
-        if default is not inspect.Parameter.empty:
-            defaults[name] = (_plain(default), f"default of {owner.__name__}")
+    given = {*RESERVED, *config.plain, *defaults, *(["action_noise"] if config.settings.noise_type else [])}
+    for name, parameter in constructor_parameters(algorithm).items():
+        if name not in given and parameter.default is not parameter.empty:
+            owner = next(parent for parent in parents if name in inspect.signature(parent).parameters)
+            defaults[name] = (_plain(parameter.default), f"default of {owner.__name__}")
     return defaults
 
 

@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_symphony.experiment.agent import finite_weights
 from sb3_symphony.experiment.callbacks import SeededEvaluation, StopOnSignal
-from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions
+from sb3_symphony.experiment.config import ConfigError, RunConfig, TrainOptions, told
 from sb3_symphony.experiment.environment import make_evaluation_env
 from sb3_symphony.experiment.signals import end_with_parent, ended_by
 from sb3_symphony.experiment.train import build_callbacks, build_model
@@ -78,7 +78,7 @@ class _SendEvaluations(BaseCallback):
 
 def _failure(error: Exception, model: BaseAlgorithm | None) -> _Failure:
     """Tell what hyper-parameters and environments can cause from mistakes in the program, which must not pass for it."""
-    what = textwrap.shorten(f"{type(error).__name__}: {error}", 300, placeholder=" …")
+    what = textwrap.shorten(told(error), 300, placeholder=" …")
     if isinstance(error, ConfigError):
         return _Failure(str(error), "failed")
     if isinstance(error, _Diverged):
