@@ -70,11 +70,6 @@ class RecordedEpisode(gym.Wrapper):
         self.observation: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode, or None to go on with the environment's generator
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         generators = self._generator_states()
         if seed is not None:
             generators.pop("env._np_random", None)  # which is about to be replaced
@@ -85,10 +80,6 @@ class RecordedEpisode(gym.Wrapper):
         return self.observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """
-        :param action: action of the environment
-        :return: observation, reward, terminated, truncated, info
-        """
         self.actions.append(np.array(action))
         result = self.env.step(action)
         self.observation = result[0]

@@ -61,11 +61,6 @@ class FreshBox2DWorld(gym.Wrapper):
         super().__init__(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode, or None to go on with the environment's generator
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         from Box2D import b2World
 
         walker: Any = self.env.unwrapped
@@ -197,11 +192,6 @@ class StallPenalty(LearningReward):
         super().__init__(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         observation, info = self.env.reset(seed=seed, options=options)
         self.previous = np.array(observation, dtype=np.float64)
         return observation, info
@@ -259,11 +249,6 @@ class StrideBonus(LearningReward):
         super().__init__(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         self.in_front, self.width = None, 0.0
         return self.env.reset(seed=seed, options=options)
 
@@ -350,11 +335,6 @@ class EpisodeStepLimit(gym.Wrapper):
         return self._total_steps if self._inner is None else self._inner.total_steps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         self._episode_steps = 0
         return self.env.reset(seed=seed, options=options)
 
@@ -413,11 +393,6 @@ class TorsoMass(gym.Wrapper):
         mujoco.mj_setConst(model, mujoco.MjData(model))  # on scratch data: it overwrites the state
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode, or None to go on with the environment's generator
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         if len(self.masses) == 2:
             # Before the reset, which computes with the mass; a stream of its own, or it would go with the first observation
             generator = self.np_random if seed is None else np.random.default_rng([seed, self.body])
@@ -443,11 +418,6 @@ class LegMass(gym.Wrapper):
         self.factor = float(factor)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode, or None to go on with the environment's generator
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         result = self.env.reset(seed=seed, options=options)
         walker: Any = self.env.unwrapped
         for leg in walker.legs:  # bodies that this reset has made

@@ -51,10 +51,6 @@ class WalkerSensors(Camera):
         return result
 
     def step(self, action: Any) -> Any:
-        """
-        :param action: action of the environment
-        :return: what the environment returns
-        """
         result = super().step(action)
         walker: Any = self.env.unwrapped
         upper_and_lower = walker.legs  # left upper, left lower, right upper, right lower

@@ -75,11 +75,6 @@ class ActionDelay(gym.Wrapper):
         self.waiting: deque[np.ndarray] = deque()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        :param seed: seed of the episode
-        :param options: handed to the environment
-        :return: first observation and info
-        """
         self.waiting.clear()
         return self.env.reset(seed=seed, options=options)
 

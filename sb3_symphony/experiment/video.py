@@ -62,19 +62,11 @@ class Camera(gym.Wrapper):
         return np.asarray(picture)
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """
-        :param kwargs: seed and options
-        :return: first observation and info
-        """
         result = self.env.reset(**kwargs)
         self.before_first = self._picture()
         return result
 
     def step(self, action: Any) -> Any:
-        """
-        :param action: action of the environment
-        :return: what the environment returns
-        """
         result = self.env.step(action)
         self.after_step = self._picture()
         return result
