@@ -376,21 +376,20 @@ def entry_name(content: Mapping[str, Any], env: str, path: Path) -> str | None:
     :param content: content of a file with an entry for each environment, or with nothing but one
     :param env: environment
     :param path: the file, for messages
-    :return: its entry, else ``default``; ``None``: the file has neither
-    :raises ConfigError: if values stand beside that entry, which would not be used
+    :return: its entry, else ``default``; ``None``: the file has no entries
+    :raises ConfigError: if it has others, or values stand beside that entry, which would not be used
     """
     name = next((name for name in (env, without_module(env), "default") if name in content), None)
+    if name is None and _has_entries(content):
+        raise ConfigError(f"{path}: no entry for '{env}'{suggestion(env, content)}")
     beside = [key for key, value in content.items() if name is not None and key != name and not isinstance(value, dict)]
     if beside:
         raise ConfigError(f"{path}: '{beside[0]}' stands beside the entry '{name}' — expected inside it")
     return name
 
 
-def has_entries(content: Mapping[str, Any]) -> bool:
-    """
-    :param content: content of a YAML file
-    :return: whether it has entries of environments: keys as no hyper-parameter has, or all of them with settings below
-    """
+def _has_entries(content: Mapping[str, Any]) -> bool:
+    """Whether a file has entries of environments: keys as no hyper-parameter has, or all of them with settings below."""
     named = any(re.search(r"-v\d+$", str(key)) for key in content)
     return named or (bool(content) and all(isinstance(value, dict) and "n_timesteps" in value for value in content.values()))
 
@@ -418,8 +417,6 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
         if not isinstance(content[name], dict):
             raise ConfigError(f"{path}: '{name}' — expected a mapping of hyper-parameters")
         return f"{path.name}, {name}" if options.conf_file is None else f"-conf {path}, {name}", content[name]
-    if has_entries(content):
-        raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     return f"-conf {path}", with_env_kwargs(content, _arguments_of_run(path))
 
 

@@ -28,7 +28,6 @@ from sb3_symphony.experiment.config import (
     Threads,
     TrainOptions,
     entry_name,
-    has_entries,
     read_yaml,
     shipped_folder,
 )
@@ -310,8 +309,6 @@ def read_space(options: TuneOptions) -> SearchSpace:
     name = entry_name(content, options.env, path)
     if name is not None:
         where, content = f"{path}: {name}", content[name]
-    elif has_entries(content):
-        raise ConfigError(f"{path}: no entry for '{options.env}'{suggestion(options.env, content)}")
     space = parse_space(content, where)
     given = [*options.hyperparams, *(["n_timesteps"] if options.n_timesteps > 0 else [])]
     parameters = {name: parameter for name, parameter in space.parameters.items() if not _covered(name, given)}
