@@ -417,6 +417,14 @@ def _advisory_lock(engine: sqlalchemy.Engine, name: str) -> Iterator[None]:
 SweepStorage = JournalSweep | PostgresSweep
 
 
+def is_url(where: str) -> bool:
+    """
+    :param where: URL of a database, or path of a journal file
+    :return: whether it is a URL
+    """
+    return re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", where) is not None  # a letter alone is a drive of Windows
+
+
 def open_storage(where: str, stopping: Callable[[], None], heartbeat: int) -> SweepStorage:
     """
     :param where: URL of a database, or path of a journal file
@@ -425,6 +433,6 @@ def open_storage(where: str, stopping: Callable[[], None], heartbeat: int) -> Sw
     :return: the storage
     :raises ConfigError: if there is none
     """
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", where):  # a letter alone is a drive of Windows
+    if is_url(where):
         return PostgresSweep(where, stopping, heartbeat)
     return JournalSweep(Path(where), stopping, heartbeat)

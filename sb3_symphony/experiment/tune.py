@@ -44,7 +44,7 @@ from sb3_symphony.experiment.sweep_report import (
     parameters_of,
     replaced,
 )
-from sb3_symphony.experiment.sweep_storage import WORKER, StorageAway, SweepStorage, open_storage
+from sb3_symphony.experiment.sweep_storage import WORKER, StorageAway, SweepStorage, is_url, open_storage
 from sb3_symphony.experiment.train import build_model
 from sb3_symphony.experiment.trial import TrialFailed, TrialProcesses, evaluation_frequency, ignore_mini_batches
 
@@ -535,7 +535,7 @@ def _open_study(plan: Plan, storage: SweepStorage) -> optuna.Study:
 
 def _show(options: TuneOptions) -> TuneResult:
     where = options.where
-    if "://" not in where and not os.path.exists(where):
+    if not is_url(where) and not os.path.exists(where):
         raise ConfigError(f"--show: there is no sweep at {where}")
     storage = open_storage(where, lambda: None, options.heartbeat)
     try:
