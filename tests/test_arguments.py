@@ -16,6 +16,7 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_symphony import REDQ, DroQ, Symphony
 from sb3_symphony.common.buffers import FadingReplayBuffer, PrioritizedReplayBuffer
+from sb3_symphony.common.callbacks import GreedyEpisodes
 from sb3_symphony.common.noise import DecayingNormalActionNoise, StickyActionNoise
 
 
@@ -330,8 +331,9 @@ def test_numpy_numbers_are_numbers(make, algorithm):
         policy_delay=np.int64(2),
         n_critics=np.int64(2),
         gamma=np.float64(0.9),
+        stats_window_size=np.int64(9),
         **extra,
-    ).learn(30)
+    ).learn(30, callback=GreedyEpisodes((0, 1), stall_steps=np.int64(3)))
 
 
 def test_a_discount_of_numpy_leaves_samples_in_single_precision(make):

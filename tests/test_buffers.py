@@ -101,9 +101,15 @@ def test_fade_weights_power():
     np.testing.assert_allclose(fade_weights(50, 4.0, 5.5), expected / expected.sum())
 
 
-@pytest.mark.parametrize("factor", [0, -1.0, float("nan"), -float("inf")])
+@pytest.mark.parametrize("factor", [0, -1.0, float("nan"), -float("inf"), 10**400])
 def test_fade_factor_refused(factor):
-    with pytest.raises(ValueError, match=f"fade_factor={factor!r}"):
+    with pytest.raises(ValueError, match=rf"fade_factor={factor!r}: .* or None \(or inf\) for uniform"):
+        FadingReplayBuffer(5, OBS, ACT, fade_factor=factor)
+
+
+@pytest.mark.parametrize("factor", [True, "7", 1j])
+def test_fade_factor_that_is_no_number(factor):
+    with pytest.raises(TypeError, match=r"fade_factor=.*: expected a number > 0, or None"):
         FadingReplayBuffer(5, OBS, ACT, fade_factor=factor)
 
 
@@ -266,6 +272,15 @@ def test_an_ended_trajectory_bootstraps_whatever_timeouts_mean(buffer_class):
     samples = buffer._get_samples(np.arange(10))
     assert not samples.dones.any()
     np.testing.assert_allclose(samples.discounts.flatten(), [0.125] * 8 + [0.25, 0.5])
+
+
+def test_an_overwritten_row_is_no_end_of_a_trajectory_any_more():
+    """SB3's algorithms, and buffers used by hand, write no timeouts here."""
+    buffer = FadingReplayBuffer(4, OBS, ACT, handle_timeout_termination=False)
+    fill(buffer, 2)
+    end_trajectory(buffer)
+    fill(buffer, 4, np.array([[0.0]] * 3 + [[1.0]]))
+    assert buffer._get_samples(np.arange(4)).dones.flatten().tolist() == [0, 1, 0, 0]
 
 
 @pytest.mark.parametrize("done, timeout", [(0, 0), (1, 0), (1, 1)])
@@ -506,6 +521,15 @@ def test_prioritised_alpha_zero_is_uniform():
     batch = buffer.sample(20_000)
     assert chi_square(np.bincount(batch.indices), np.full(10, 0.1)) > 1e-3
     assert th.all(batch.weights == 1)
+
+
+@pytest.mark.parametrize("alpha, error", [(60, 0.0), (2, 1e200)])
+def test_priorities_whose_powers_cannot_be_told(alpha, error):
+    buffer = PrioritizedReplayBuffer(10, OBS, ACT, alpha=alpha)
+    fill(buffer, 5)
+    with pytest.raises(ValueError, match=f"alpha={alpha}: expected less"):
+        buffer.update_priorities([0, 1], [1.0, error])
+    assert buffer.tree.total == 5
 
 
 def test_prioritised_refusals():

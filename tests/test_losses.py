@@ -246,6 +246,8 @@ def test_slope_of_the_values_expected():
         (((2, -2),), "value_range=(2, -2): expected the smaller number first"),
         (((0, float("inf")),), "value_range=inf: expected a number"),
         (((0, 1), 1), "n_bins=1: expected an integer >= 2"),
+        (((1e8, 1e8 + 1),), "value_range=(100000000.0, 100000001.0): expected bins that torch.float32 can tell apart"),
+        (((0, 1e39),), "value_range=(0, 1e+39): expected bins that torch.float32 can tell apart"),
     ],
 )
 def test_wrong_bins(arguments, message):

@@ -47,6 +47,7 @@ def test_reflection():
         (dict(offset=[0.1]), r"offset=\[0.1\]: expected a list of pairs"),
         (dict(offset=[[0, float("nan")]]), "it: offset of 0=nan"),
         (dict(offset=[[7, 1.0]]), "it: index=7"),
+        (dict(offset=[[0, 0.1], [0, 0.0]]), r"offset=\[\[0, 0.1\], \[0, 0.0\]\]: expected each index once"),
         (dict(negate=2), "negate=2: expected a list of indices"),
         (dict(negate=[True]), "it: index=True"),
     ],
@@ -79,6 +80,8 @@ def test_only_vectors():
         Mirror({"observation": {}, "action": {}}, spaces.Box(0, 1, (2, 2)), ACTION)
     with pytest.raises(ValueError, match="expected actions that are vectors"):
         Mirror({"observation": {}, "action": {}}, OBSERVATION, spaces.Discrete(3))
+    with pytest.raises(ValueError, match="of real numbers, got Box"):  # 3 of 8 bits, negated, would be 253
+        Mirror({"observation": {}, "action": {}}, spaces.Box(0, 255, (2,), np.uint8), ACTION)
 
 
 def filled(cls: type, n_envs: int = 1, **kwargs: Any) -> Any:

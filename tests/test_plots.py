@@ -91,6 +91,7 @@ def test_running_mean():
     np.testing.assert_allclose(running_mean(np.array([1.0, 2.0, 3.0, 4.0]), 2), [1.0, 1.5, 2.5, 3.5])
     known = running_mean(np.array([1.0, 2.0, np.nan, 4.0, 5.0, 6.0]), 2)
     np.testing.assert_array_equal(known, [1.0, 1.5, np.nan, np.nan, 4.5, 5.5])
+    np.testing.assert_array_equal(running_mean(np.array([np.inf, 1.0, 1.0, 3.0]), 2), [np.nan, np.nan, 1.0, 2.0])
 
 
 def test_block_mean():

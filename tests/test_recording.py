@@ -160,6 +160,11 @@ def test_what_wrappers_see_of_the_simulator_stays_that(view, outside):
     assert rewards[0] == rewards[1]
 
 
+def test_without_a_monitor_inside():
+    with pytest.raises(TypeError, match=r"RecordedEpisode: .* expected a Monitor inside"):
+        RecordedEpisode(gym.make("Pendulum-v1"))
+
+
 def test_rewards_that_come_out_otherwise_are_noticed():
     """Those of a wrapper around the monitor, which does not see them."""
 

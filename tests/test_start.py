@@ -18,6 +18,7 @@ from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_symphony.cli import main
+from sb3_symphony.common.buffers import FadingReplayBuffer
 from sb3_symphony.common.checkpoint import newest_checkpoint
 from sb3_symphony.common.replay_files import ReplaySegments, add_transitions
 from sb3_symphony.experiment.config import ConfigError, RunSettings, TrainOptions, load_config
@@ -289,6 +290,18 @@ def test_transitions_in_the_order_of_time():
         np.testing.assert_array_equal(found["next_observations"][:, 1, 0], np.arange(12 - min(size, 7), 12))
         ends = np.isin(np.arange(11 - min(size, 7), 11), (8, 10))  # the new run's episode does not go on from the last
         np.testing.assert_array_equal(found["timeouts"][:, 0], ends)
+
+
+def test_the_first_of_other_transitions_are_no_first_steps():
+    """The source's oldest rows are from amid an episode."""
+    space = gym.spaces.Box(-100, 100, (1,))
+    source = ReplayBuffer(14, space, space)
+    for i in range(20):
+        row = np.full((1, 1), i % 12, dtype=np.float32)
+        source.add(row, row + 1, row, row[:, 0], np.array([i % 12 == 11]), [{}])
+    target = FadingReplayBuffer(13, space, space, start_share=1.0, start_steps=4, fade_factor=None)
+    add_transitions(target, [ReplaySegments.of(source)])
+    assert set(target.sample(200).observations.flatten().tolist()) == {0, 1, 2, 3}
 
 
 def test_resumed_run_that_started_from_a_trained_agent(folder):

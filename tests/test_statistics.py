@@ -122,6 +122,9 @@ def test_nan_is_not_left_out():
 def test_summary():
     sample = [2, 4, 4, 4, 5, 5, 7, 9]
     assert summarise(sample) == Summary(n=8, mean=5.0, std=2.0, iqm=4.5)
+    for wrong in ([], [[1, 2], [3, 4]], 3.0):
+        with pytest.raises(ValueError, match="expected a sample of at least one"):
+            summarise(wrong)
     low, high = bootstrap_interval([sample])
     assert 2 <= low < 4.5 < high <= 9
 

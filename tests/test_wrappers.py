@@ -244,6 +244,7 @@ def test_wrong_reward_values():
         (lambda: StrideBonus(env, bonus=float("nan")), "bonus=nan"),
         (lambda: StrideBonus(env, hips=(0, 2)), "hips=2: expected an integer >= 0 and <= 1"),
         (lambda: StrideBonus(env, hips=(0,)), r"hips=\(0,\): expected two numbers"),
+        (lambda: StrideBonus(env, hips=(1, 1)), r"hips=\(1, 1\): expected two different indices"),
         (lambda: StrideBonus(env, hips=(0, 1), margin=-0.1), r"margin=-0\.1"),
         (lambda: StrideBonus(env, hips=(0, 1), per_radian="yes"), "per_radian='yes'"),
     ):

@@ -97,9 +97,9 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     """
     :param values: shape ``(n,)``
     :param window: number of values in a mean, fewer at the start
-    :return: trailing means, shape ``(n,)``; NaN where one of the values is
+    :return: trailing means, shape ``(n,)``; NaN where one of the values is not finite
     """
-    unknown = np.isnan(values)
+    unknown = ~np.isfinite(values)
     sums, unknowns = (np.concatenate([[0], np.cumsum(each)]) for each in (np.where(unknown, 0.0, values), unknown))
     last = np.arange(1, len(values) + 1)
     first = np.maximum(last - window, 0)

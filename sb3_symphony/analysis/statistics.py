@@ -103,8 +103,11 @@ def summarise(values: ArrayLike) -> Summary:
     """
     :param values: sample, shape ``(n,)``
     :return: its statistics
+    :raises ValueError: if it is empty, or no sample
     """
     sample = np.asarray(values, dtype=np.float64)
+    if sample.ndim != 1 or not len(sample):
+        raise ValueError(f"values: expected a sample of at least one, shape (n,), got {sample.shape}")
     return Summary(len(sample), float(sample.mean()), float(sample.std()), float(iqm(sample)))
 
 

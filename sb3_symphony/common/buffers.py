@@ -30,13 +30,16 @@ from sb3_symphony.common.mirror import Mirror
 
 
 def _check_fading(fade_factor: float | None, fade_power: float) -> None:
-    if fade_factor is not None and not (isinstance(fade_factor, int | float | np.number) and fade_factor > 0):  # NaN neither
-        raise ValueError(f"fade_factor={fade_factor!r}: expected a number > 0, or None (or inf) for uniform sampling")
+    if not _is_uniform(fade_factor):
+        try:
+            check_number("fade_factor", fade_factor, 0, exclusive=True)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"{error}, or None (or inf) for uniform sampling") from None
     check_number("fade_power", fade_power, 0, 100, exclusive=True)  # draws take as many trials
 
 
 def _is_uniform(fade_factor: float | None) -> bool:
-    return fade_factor is None or math.isinf(fade_factor)
+    return fade_factor is None or fade_factor == math.inf
 
 
 @lru_cache(maxsize=64)
@@ -178,6 +181,11 @@ class FadedSampling(ReplayBuffer):
         super().__init__(*args, **kwargs)
         self.fade_factor = fade_factor
         self.fade_power = fade_power
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        # A mark of end_trajectory(), which SB3 overwrites only if it handles timeouts
+        self.timeouts[self.pos] = 0
+        super().add(*args, **kwargs)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None, uniform: bool = False) -> Any:
         """
@@ -324,7 +332,7 @@ class FadingDictReplayBuffer(FadedSampling, DictReplayBuffer):
     :param gamma: unused, accepted so that both fading buffers take the same arguments
     :param fade_factor: steepness f > 0; ``None`` or ``inf`` means uniform
     :param fade_power: power of the normalised age index, in (0, 100]
-    :raises ValueError: for a value outside the ranges above, or ``optimize_memory_usage=True``
+    :raises ValueError: for a value outside the ranges above, other observations, or ``optimize_memory_usage=True``
     """
 
     # SB3 declares one array on the parent and a dictionary on the Dict buffer
@@ -346,6 +354,8 @@ class FadingDictReplayBuffer(FadedSampling, DictReplayBuffer):
         fade_power: float = 2.0,
     ) -> None:
         _refuse_memory_optimisation("FadingDictReplayBuffer", optimize_memory_usage)
+        if not isinstance(observation_space, spaces.Dict):
+            raise ValueError("FadingDictReplayBuffer holds Dict observations: use FadingReplayBuffer for others")
         if n_steps != 1:
             raise ValueError(f"n_steps={n_steps!r}: expected 1, n-step returns are not supported for Dict observations")
         super().__init__(
@@ -604,7 +614,8 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
 
         :param indices: ``indices`` of the samples, shape ``(batch,)``
         :param td_errors: temporal-difference errors, ``batch`` values in any shape; the sign does not matter
-        :raises ValueError: if the numbers of indices and errors differ, an index is out of range or an error not finite
+        :raises ValueError: if the numbers of indices and errors differ, an index is out of range, an error not finite, or a
+            priority too large or small for its power
         """
         if isinstance(td_errors, th.Tensor):
             td_errors = td_errors.detach().cpu().numpy()
@@ -619,6 +630,10 @@ class PrioritizedReplayBuffer(_StepsReplayBuffer):
         stored = self.size() * self.n_envs
         if indices.min() < 0 or indices.max() >= stored:
             raise ValueError(f"update_priorities: indices must lie in [0, {stored}), the stored transitions")
-        self.tree.set(indices, priorities**self.alpha)
+        with np.errstate(over="ignore", under="ignore"):
+            powers = priorities**self.alpha
+        if not np.all(np.isfinite(powers) & (powers > 0)):
+            raise ValueError(f"update_priorities: alpha={self.alpha!r}: expected less, powers of errors are 0 or infinite")
+        self.tree.set(indices, powers)
         self.max_priority = max(self.max_priority, float(priorities.max()))
         self._samples_without_update = 0

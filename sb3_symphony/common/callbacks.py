@@ -240,7 +240,7 @@ class GreedyEpisodes(_OnReturn):
         check_number("stall_steps", stall_steps, 1, integer=True)
         self.in_row = in_row
         self.stall_reward = stall_reward
-        self.stall_steps = stall_steps
+        self.stall_steps = int(stall_steps)  # deques take no number of NumPy
         # Of each environment the latest rewards of its episode, how many greedy episodes there were in a row, and whether
         # it acts greedily now
         self.rewards: list[deque[float]] = []

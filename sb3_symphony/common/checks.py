@@ -4,6 +4,7 @@ import difflib
 import inspect
 import math
 import operator
+import sys
 from collections.abc import Iterable
 from typing import Any
 
@@ -43,7 +44,8 @@ def check_number(
         number = value
     if isinstance(value, bool) or not isinstance(number, int if integer else (int, float, np.floating)):
         raise TypeError(message)
-    if not math.isfinite(number) or not low <= number <= high or number >= below or (exclusive and number == low):
+    largest = sys.float_info.max  # whole numbers may be larger
+    if not max(low, -largest) <= number <= min(high, largest) or number >= below or (exclusive and number == low):
         raise ValueError(message)
 
 
@@ -98,7 +100,7 @@ def suggestion(value: Any, options: Iterable[Any]) -> str:
     :return: ``": did you mean 'x'?"``, or ``""`` if nothing is near
     """
     by_lower = {str(option).lower(): option for option in options}
-    nearest = difflib.get_close_matches(str(value).lower(), by_lower, n=1)
+    nearest = [] if value is None else difflib.get_close_matches(str(value).lower(), by_lower, n=1)
     return f": did you mean {by_lower[nearest[0]]!r}?" if nearest else ""
 
 

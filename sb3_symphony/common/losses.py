@@ -132,6 +132,8 @@ class ValueBins(nn.Module):
             raise ValueError(f"value_range={value_range!r}: expected the smaller number first")
         check_number("n_bins", n_bins, 2, integer=True)
         edges = th.linspace(low, high, n_bins + 1, dtype=th.float64).to(th.get_default_dtype())
+        if not (edges.isfinite().all() and (edges.diff() > 0).all()):
+            raise ValueError(f"value_range={value_range!r}: expected bins that {edges.dtype} can tell apart")
         self.value_range, self.n_bins = (low, high), n_bins
         self.register_buffer("edges", edges, persistent=False)
         self.register_buffer("centers", ((edges[1:] + edges[:-1]) / 2)[:, None], persistent=False)

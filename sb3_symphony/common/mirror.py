@@ -21,7 +21,7 @@ class Reflection:
     :param negate: indices of components that change sign, such as sideways velocities; of a pair, both
     :param offset: pairs of an index and what is added to that component afterwards, for joints whose zeros differ between
         the sides
-    :raises ValueError: for an index out of range or in two pairs, or if it does not give the vector back
+    :raises ValueError: for an index out of range or in two pairs of one kind, or if it does not give the vector back
     :raises TypeError: if something has the wrong type
     """
 
@@ -43,8 +43,9 @@ class Reflection:
             check_number(f"{name}: index", index, 0, size - 1, integer=True)
         for index, value in offset:
             check_number(f"{name}: offset of {index}", value)
-        if len(set(swapped)) < len(swapped):
-            raise ValueError(f"{name}: swap={swap!r}: expected each index once")
+        for key, given, indices in (("swap", swap, swapped), ("offset", offset, [index for index, _ in offset])):
+            if len(set(indices)) < len(indices):
+                raise ValueError(f"{name}: {key}={given!r}: expected each index once")
 
         self.order = th.arange(size)
         for left, right in swap:
@@ -90,8 +91,8 @@ class Mirror:
             raise ValueError(f"mirror={values!r}: expected a mapping with the keys observation and action")
         reflections = []
         for name, space in (("observation", observation_space), ("action", action_space)):
-            if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-                raise ValueError(f"mirror: expected {name}s that are vectors (Box), got {space}")
+            if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
+                raise ValueError(f"mirror: expected {name}s that are vectors (Box) of real numbers, got {space}")
             if not isinstance(values[name], Mapping):
                 raise TypeError(f"mirror: {name}={values[name]!r}: expected a mapping of swap, negate and offset")
             for key in values[name]:

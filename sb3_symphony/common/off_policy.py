@@ -172,6 +172,7 @@ class EnsembleOffPolicyAlgorithm(ActsGreedily):
         check_number("n_critics", self.n_critics, 1, integer=True)
         check_number("policy_delay", self.policy_delay, 1, integer=True)
         check_number("stats_window_size", self._stats_window_size, 1, integer=True)
+        self._stats_window_size = int(self._stats_window_size)  # deques take no number of NumPy
         check_choice("target_mode", self.target_mode, TARGET_MODES)
         check_choice("critic_loss", self.critic_loss, (*CRITIC_LOSSES, CLASSIFICATION))
         check_choice("critic_reduction", self.critic_reduction, ("independent", "ensemble_mean"))

@@ -59,11 +59,14 @@ class RecordedEpisode(gym.Wrapper):
     It has to be the outermost wrapper. What the wrappers inside know at the episode's start is remembered too, since some
     count or average over episodes.
 
-    :param env: environment
+    :param env: environment, with a ``Monitor`` around it or around what it wraps
+    :raises TypeError: if there is none
     """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
+        if unwrap_wrapper(env, Monitor) is None:
+            raise TypeError(f"RecordedEpisode: {env} — expected a Monitor inside (make_vec_env: wrapper_class=RecordedEpisode)")
         self.start: dict[str, Any] = {}
         self.actions: list[Any] = []
         self.rewards: list[Any] = []

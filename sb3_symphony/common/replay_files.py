@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from sb3_symphony.common.buffers import STORAGE, end_trajectory
+from sb3_symphony.common.buffers import STORAGE, FadingReplayBuffer, end_trajectory
 from sb3_symphony.common.checks import constructor_parameters
 from sb3_symphony.common.files import seal, unseal
 
@@ -148,6 +148,9 @@ def add_transitions(buffer: ReplayBuffer, parts: Iterable[dict[str, np.ndarray]]
             return rows[name][row]
         return {key.partition(".")[2]: array[row] for key, array in rows.items() if key.startswith(f"{name}.")}
 
+    if isinstance(buffer, FadingReplayBuffer):
+        # The first row may be from amid an episode: until one ends, nothing tells which are its first steps
+        buffer.episode_steps[:] = buffer.start_steps
     count = len(rows["rewards"])
     for row in range(count):
         buffer.add(

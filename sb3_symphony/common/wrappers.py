@@ -239,6 +239,8 @@ class StrideBonus(LearningReward):
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise TypeError(f"StrideBonus: expected a Box observation space of one axis, got {space}")
         check_pair("hips", hips, "indices of the hip angles", 0, space.shape[0] - 1, integer=True)
+        if hips[0] == hips[1]:
+            raise ValueError(f"hips={hips!r}: expected two different indices")
         check_number("offset", offset)
         check_number("margin", margin, 0)
         check_choice("per_radian", per_radian, [False, True])
