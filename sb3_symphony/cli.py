@@ -250,7 +250,7 @@ def _train(arguments: dict[str, Any], argv: Sequence[str]) -> int:
     tell({"runs": [result.plain() for result in results]})
     if not options.quiet:
         print(results[-1].summary())
-    return 130 if results[-1].interrupted else 0
+    return 130 if results[-1].interrupted or len(results) < options.n_seeds else 0
 
 
 def _wrapper(text: str) -> str:

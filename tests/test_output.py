@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from sb3_symphony.experiment.config import ConfigError
-from sb3_symphony.experiment.output import json_report, output_file, output_folder, write_output
+from sb3_symphony.experiment.config import ConfigError, TrainOptions
+from sb3_symphony.experiment.output import alone, json_report, output_file, output_folder, write_output
+from sb3_symphony.experiment.train import train
 
 
 @contextmanager
@@ -78,6 +79,9 @@ def test_bad_names(folder):
             call()
         assert str(error.value) == message
     assert [path.name for path in folder.iterdir()] == ["file"]
+    (folder / "loop").symlink_to("loop")
+    with pytest.raises(ConfigError, match="'loop' cannot be written"):
+        output_file("loop", "-o")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
@@ -95,7 +99,14 @@ def test_without_permission(folder):
         ):
             with pytest.raises(ConfigError, match=r"-o: .locked.*. cannot be written — Permission denied"):
                 call()
+        with pytest.raises(ConfigError, match=r"locked/\.lock' cannot be locked — Permission denied"), alone(locked, "in use"):
+            pass
     assert (locked / "out.json").read_text() == "mine" and len(list(locked.iterdir())) == 1
+    locked.chmod(0o700)
+    with ordinary_user():
+        for arguments in ({"conf_file": "locked/a.yml"}, {"resume": "locked/run"}):
+            with pytest.raises(ConfigError, match=r"locked/.*' cannot be read — Permission denied"):
+                train(TrainOptions(algo="td3", env="Pendulum-v1", **arguments))
 
 
 def test_writing(folder):

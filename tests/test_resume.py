@@ -19,15 +19,17 @@ from filelock import FileLock
 from resume_helpers import GlobalRandomEnv, assert_same_results, difference, monitor_rows
 from stable_baselines3 import TD3
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_symphony.analysis.runs import open_run
 from sb3_symphony.cli import main
 from sb3_symphony.common.checkpoint import ExactCheckpoints, newest_checkpoint
+from sb3_symphony.experiment.callbacks import save_model
 from sb3_symphony.experiment.config import ConfigError, TrainOptions
 from sb3_symphony.experiment.environment import EpisodeSeeds
 from sb3_symphony.experiment.registry import ALGORITHMS, load_algorithm
-from sb3_symphony.experiment.train import train
+from sb3_symphony.experiment.train import train, train_seeds
 
 # Most runs below are killed after step 200 of 260 and resumed there: fifty updates come before
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 150, "buffer_size": 1000, "batch_size": 16}
@@ -257,6 +259,15 @@ def test_tensorboard_goes_on_in_its_folder(killed, folder):
     assert [step for step, _ in scalars("tb_b")["rollout/ep_len_mean"]] == [200, 400]
 
 
+def test_tensorboard_goes_on_though_the_note_of_its_folder_was_emptied(killed):
+    run = killed(230, options(tensorboard_log="tb"))
+    note = run / "Pendulum-v1" / "tensorboard.txt"
+    before = note.read_text()
+    note.write_text("")
+    resume(run)
+    assert note.read_text() == before and not list(note.parent.glob("events*"))
+
+
 def test_a_copy_has_a_log_of_its_own(folder):
     run = train(options(log_folder="b", tensorboard_log="tb", n_timesteps=450, save_freq=150, eval_freq=60, keep=5)).run.path
     copy = run.with_name("Pendulum-v1_2")
@@ -330,6 +341,29 @@ def test_forced_to_stop_before_the_first_checkpoint(monkeypatch, capsys):
     assert "stopped before its first checkpoint, begins again" in capsys.readouterr().out
     assert_same_results(whole, result.run.path)
     assert TD3.load(result.run.path / "rl_model_90_steps.zip").num_timesteps == 90
+
+
+def test_forced_to_stop_in_a_rollout_longer_than_the_steps_between_checkpoints(interrupt, capsys):
+    whole = train(options("ppo", log_folder="a", save_freq=20)).run.path
+    interrupt(25, times=2)
+    run = train(options("ppo", log_folder="b", save_freq=20)).run.path
+    resume(run)
+    assert "stopped before its first checkpoint, begins again" in capsys.readouterr().out
+    assert_same_results(whole, run)
+
+
+def test_started_from_an_agent_that_has_moved_before_the_first_checkpoint(killed):
+    train(options(log_folder="a"))
+    begin = {"trained_agent": "a/td3/Pendulum-v1_1"}
+    whole = train(options(log_folder="b", **begin)).run.path
+    run = killed(90, options(log_folder="c", **begin))
+    Path("a").rename("d")
+    with pytest.raises(ConfigError, match=r"-i: a/td3/Pendulum-v1_1.*: no such file"):
+        resume(run)
+    with pytest.raises(ConfigError, match="--trained-agent: 'd/td3/Other_1' contradicts the run"):
+        resume(run, trained_agent="d/td3/Other_1")
+    resume(run, trained_agent="d/td3/Pendulum-v1_1")
+    assert_same_results(whole, run)
 
 
 def test_killed_before_the_first_checkpoint(killed, capsys):
@@ -433,6 +467,8 @@ def test_not_a_run(folder, capsys):
     for name, message in (("nowhere", "no such folder"), ("empty", "no run folder")):
         assert main(["train", "--resume", name]) == 2
         assert message in capsys.readouterr().err
+    assert main(["train", "--resume", "x" * 300]) == 2
+    assert f"--resume: '{'x' * 300}' cannot be read — File name too long" in capsys.readouterr().err
     assert list(folder.iterdir()) == [folder / "empty"]
     (folder / "zoo" / "Pendulum-v1").mkdir(parents=True)
     arguments = "!!python/object/apply:collections.OrderedDict [[[algo, td3], [env, Pendulum-v1], [max_total_trials, null]]]"
@@ -566,6 +602,17 @@ def test_monitor_and_evaluations_are_what_they_were(killed):
     assert_same_results(whole, run)
 
 
+def test_best_models_of_a_future_that_was_given_up(killed):
+    run = killed(200, options(eval_freq=60, save_freq=110))
+    (run / "best_model.zip").write_bytes(b"that of a step that is taken otherwise this time")
+    resume(run, n_timesteps=115)
+    assert TD3.load(run / "best_model.zip").num_timesteps == 60
+    begins_again = killed(90, options(log_folder="b", eval_freq=60, save_freq=110))
+    assert (begins_again / "best_model.zip").is_file()
+    resume(begins_again, n_timesteps=50)
+    assert not (begins_again / "best_model.zip").exists()
+
+
 def fill_disk_at(monkeypatch, name):
     """From the first synchronisation of a file with ``name`` in its path on, the disk is full."""
     fsync, failed = os.fsync, []
@@ -604,6 +651,20 @@ def test_no_room_for_a_saved_model(monkeypatch):
     assert [path.name for path in run.glob("*rl_model*")] == ["rl_model_100_steps.zip"]  # no part of the other
     resume(run)
     assert_same_results(whole, run)
+
+
+def test_no_room_for_a_model_beside_its_statistics(monkeypatch, tmp_path):
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+    model, files = TD3("MlpPolicy", env, policy_kwargs={"net_arch": [8]}), (tmp_path / "model.zip", tmp_path / "model.pkl")
+    save_model(model, *files)
+    before = [file.read_bytes() for file in files]
+    env.reset()
+    with monkeypatch.context() as patched, pytest.raises(OSError, match="No space left"):
+        fill_disk_at(patched, "model.zip")
+        save_model(model, *files)
+    assert [file.read_bytes() for file in files] == before and len(list(tmp_path.iterdir())) == 2
+    save_model(model, *files)
+    assert files[1].read_bytes() != before[1]
 
 
 def test_no_room_at_the_end(monkeypatch, capsys):
@@ -691,6 +752,14 @@ def test_interrupted_in_the_last_step(interrupt, times):
     assert_same_results(whole, result.run.path)
 
 
+def test_a_series_that_is_interrupted_in_the_last_step_of_a_run(interrupt, monkeypatch):
+    interrupt(260)
+    (result,) = train_seeds(options(n_seeds=2))
+    assert result.signalled and not result.interrupted and resume(result.run.path).untouched
+    monkeypatch.setattr("sb3_symphony.experiment.train.train_seeds", lambda *args, **kwargs: [result])
+    assert main(["train", "--n-seeds", "2"]) == 130 and main(["train"]) == 0
+
+
 def test_resume_that_is_interrupted_before_it_begins(killed, monkeypatch):
     """A model that has not got its state yet must not replace the saved one."""
     whole = train(options(log_folder="a")).run.path
@@ -709,6 +778,11 @@ CHANGED = {
     "buffer_size": (150, "buffer_size of its replay buffer is 1000, not 150"),
     "n_steps": (2, "its replay buffer is no NStepReplayBuffer"),
     "noise_type": ("ornstein-uhlenbeck", "action_noise: the checkpoint is of another one than OrnsteinUhlenbeckActionNoise"),
+    "normalize": (True, r"wrappers around all copies of the environment \(normalize, frame_stack\): 0 there, 1 here"),
+    "env_wrapper": (
+        [{"sb3_symphony.common.wrappers.RewardFloor": {"floor": -30}}],
+        "wrappers around each environment .*: 3 there, 4 here",
+    ),
 }
 
 
@@ -726,8 +800,7 @@ def test_a_configuration_that_was_changed(killed, key):
         ConfigError, match=r"config\.yml was changed: the checkpoint at 200 steps is of another model — .*" + message
     ):
         resume(run)
-    if key != "noise_type":  # of which is known too late that it is another one
-        assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == files
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == files
     config.write_text(before)
     resume(run)
     assert_same_results(whole, run)

@@ -260,9 +260,10 @@ def _plain_mapping(path: Path) -> dict[str, Any]:
 def noted_log(note: Path) -> Path | None:
     """
     :param note: file of a run that tells where its TensorBoard log is, relative to the file
-    :return: that folder, which may be gone; None if there is no such file
+    :return: that folder, which may be gone; None if there is no such file, or nothing in it
     """
-    return Path(os.path.normpath(note.parent / note.read_text(encoding="utf-8").strip())) if note.exists() else None
+    told = note.read_text(encoding="utf-8").strip() if note.exists() else ""
+    return Path(os.path.normpath(note.parent / told)) if told else None
 
 
 def open_run(folder: Path) -> Run:

@@ -123,6 +123,22 @@ def training_state(model: BaseAlgorithm) -> dict[str, Any]:
     }
 
 
+def _check_surroundings(model: BaseAlgorithm, state: dict[str, Any]) -> None:
+    """Look whether noise and wrappers are those of a state."""
+    assert model.env is not None
+    noise = getattr(model, "action_noise", None)
+    if (state["noise"] or {}).keys() != ({} if noise is None else vars(noise)).keys():
+        raise ValueError(f"action_noise: the checkpoint is of another one than {noise}")
+    there, own = len(state["vec env"]), len(vec_env_state(model.env))
+    if there != own:
+        raise ValueError(f"wrappers around all copies of the environment (normalize, frame_stack): {there} there, {own} here")
+    episodes = model.env.env_method("recorded_state") if is_recorded(model.env) else []
+    for kept, episode in zip(state.get("episodes", []), episodes, strict=False):
+        there, own = len(kept["wrappers"]), len(episode["wrappers"])
+        if there != own:
+            raise ValueError(f"wrappers around each environment (env_wrapper): {there} there, {own} here")
+
+
 def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     """
     Give a model built with the same arguments the state of another one, in place.
@@ -132,6 +148,7 @@ def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     :raises ValueError: if it is of another model, as far as that is seen; what is not may raise any error
     """
     assert model.env is not None
+    _check_surroundings(model, state)
     vars(model).update(state["attributes"])
     model.set_parameters(state["parameters"], exact_match=True, device=model.device)
     for name, value in state["tensors"].items():
@@ -139,10 +156,7 @@ def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     for distribution, (matrix, matrices) in zip(_gsde_distributions(model), state["gSDE"], strict=True):
         distribution.exploration_mat = matrix.to(model.device)
         distribution.exploration_matrices = matrices.to(model.device)
-    noise = getattr(model, "action_noise", None)
-    if (state["noise"] or {}).keys() != ({} if noise is None else vars(noise)).keys():
-        raise ValueError(f"action_noise: the checkpoint is of another one than {noise}")
-    if noise is not None:
+    if (noise := getattr(model, "action_noise", None)) is not None:
         vars(noise).update(state["noise"])  # in place: learn() holds it already
     for name, values in state["log"].items():
         vars(model.logger)[name].update(values)
@@ -218,7 +232,7 @@ def _fitting(checkpoint: Checkpoint) -> Iterator[None]:
 
 def check_fit(model: BaseAlgorithm, checkpoint: Checkpoint) -> None:
     """
-    Look whether a model's networks, whose values they take, and its replay buffer are those of a checkpoint.
+    Look whether a model's networks, whose values they take, its replay buffer, noise and wrappers are those of a checkpoint.
 
     :param model: an algorithm that is to go on from it, before its ``learn()``
     :param checkpoint: the checkpoint
@@ -228,6 +242,7 @@ def check_fit(model: BaseAlgorithm, checkpoint: Checkpoint) -> None:
         model.set_parameters(checkpoint.state["parameters"], exact_match=True, device=model.device)
         if (buffer := getattr(model, "replay_buffer", None)) is not None:
             check_buffer(buffer, checkpoint.state["buffer"])
+        _check_surroundings(model, checkpoint.state)
 
 
 class ExactCheckpoints(BaseCallback):

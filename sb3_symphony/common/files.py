@@ -8,7 +8,7 @@ import hashlib
 import io
 import os
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -35,18 +35,32 @@ def write_atomically(path: Path, content: bytes) -> None:
     :param content: its content
     :raises OSError: if it cannot be written; a file that was there before stays as it was
     """
-    path = path.resolve()
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    write_together({path: content})
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """
+    :func:`write_atomically` for files that belong together: none is replaced before all are written.
+
+    :param contents: files, or links to them, and the content of each
+    :raises OSError: if one cannot be written; files that were there before stay as they were
+    """
+    paths = [path.resolve() for path in contents]
+    temporaries = [path.with_name(f".{path.name}.{os.getpid()}.tmp") for path in paths]
     try:
-        with open(temporary, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        for temporary, content in zip(temporaries, contents.values(), strict=True):
+            with open(temporary, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        for temporary, path in zip(temporaries, paths, strict=True):
+            os.replace(temporary, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        for temporary in temporaries:
+            temporary.unlink(missing_ok=True)
         raise
-    _synchronise_folder(path.parent)
+    for folder in {path.parent for path in paths}:
+        _synchronise_folder(folder)
 
 
 @contextmanager

@@ -66,7 +66,7 @@ class RecordedEpisode(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         if unwrap_wrapper(env, Monitor) is None:
-            raise TypeError(f"RecordedEpisode: {env} — expected a Monitor inside (make_vec_env: wrapper_class=RecordedEpisode)")
+            raise TypeError(f"RecordedEpisode: {env} — expected a Monitor inside (make_vec_env: wrapper_class=…)")
         self.start: dict[str, Any] = {}
         self.actions: list[Any] = []
         self.rewards: list[Any] = []

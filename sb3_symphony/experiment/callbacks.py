@@ -24,7 +24,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_symphony.analysis.statistics import first_stable_evaluation
-from sb3_symphony.common.files import completed, write_atomically
+from sb3_symphony.common.files import completed, write_atomically, write_together
 from sb3_symphony.experiment.config import ConfigError
 from sb3_symphony.experiment.decode import argument_types, class_by_name, typed_arguments
 from sb3_symphony.experiment.signals import handled_by
@@ -77,7 +77,7 @@ class _EvaluationAborted(Exception):
 
 def save_model(model: BaseAlgorithm, path: Path, normalization_path: Path) -> None:
     """
-    Save a model and, before it, the statistics of ``VecNormalize`` that belong to it. If that fails, files that were there
+    Save a model together with the statistics of ``VecNormalize`` that belong to it. If that fails, files that were there
     before stay as they were.
 
     :param model: the model
@@ -85,12 +85,11 @@ def save_model(model: BaseAlgorithm, path: Path, normalization_path: Path) -> No
     :param normalization_path: file of the statistics, if there are any
     :raises OSError: if one of them cannot be written
     """
-    normalization = model.get_vec_normalize_env()
-    if normalization is not None:
-        write_atomically(normalization_path, pickle.dumps(normalization))
     content = io.BytesIO()
     model.save(content)
-    write_atomically(path, content.getvalue())
+    normalization = model.get_vec_normalize_env()
+    statistics = {} if normalization is None else {normalization_path: pickle.dumps(normalization)}
+    write_together({**statistics, path: content.getvalue()})
 
 
 class SavedModels(CheckpointCallback):
@@ -226,7 +225,7 @@ class NoteLogFolder(BaseCallback):
     def _on_training_start(self) -> None:
         folder = self.logger.get_dir()
         if self.model.tensorboard_log and folder is not None:  # else SB3's logger has an empty one among the temporary ones
-            self.path.write_text(f"{os.path.relpath(folder, self.path.parent)}\n", encoding="utf-8")
+            write_atomically(self.path, f"{os.path.relpath(folder, self.path.parent)}\n".encode())
 
     def _on_step(self) -> bool:
         return True

@@ -269,7 +269,7 @@ def run_cell(job: Job) -> bool:
     run = RunFolder(Path(job.run), RunFolder.file_name(options.env))
     if begun(run):
         _wait_for_predecessor(run)
-        onward = {name: getattr(options, name) for name in ("algo", "n_timesteps", "save_freq", "device")}
+        onward = {name: getattr(options, name) for name in ("algo", "n_timesteps", "save_freq", "device", "trained_agent")}
         again = TrainOptions(resume=str(run.path), **onward)
         result = train(again, _command(options))
     else:

@@ -405,8 +405,11 @@ def find_entry(options: TrainOptions) -> tuple[str, dict[str, Any]]:
     path = Path(shipped_folder() / f"{options.algo}.yml" if options.conf_file is None else options.conf_file)
     if options.conf_file is None and is_file(options.algo):
         raise ConfigError(f"--conf-file: missing — expected settings for {options.algo}, such as the name of its parent, redq")
-    if not path.is_file():
-        path = shipped_file(str(path)) or path
+    try:
+        if not path.is_file():
+            path = shipped_file(str(path)) or path
+    except OSError as error:
+        raise ConfigError(f"-conf: '{path}' cannot be read — {error.strerror}") from None
     if not path.is_file() and not path.suffix and len(path.parts) == 1:
         presets = [file.stem for file in (*shipped_folder().glob("presets/*.yml"), *shipped_folder().glob("*.yml"))]
         near = suggestion(path, presets) or f" — expected a YAML file or one of {', '.join(sorted(presets))}"

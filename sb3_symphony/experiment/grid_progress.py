@@ -11,7 +11,7 @@ import yaml
 from sb3_symphony.experiment.cell import begun, read_result
 from sb3_symphony.experiment.config import ConfigError, RunConfig, parse_yaml, read_yaml
 from sb3_symphony.experiment.registry import without_folder
-from sb3_symphony.experiment.run_folder import RunFolder
+from sb3_symphony.experiment.run_folder import RunFolder, last_parts
 from sb3_symphony.experiment.study import Cell, Study, cells_of, configuration, found_by, sweep_options
 
 State = Literal["queued", "running", "done", "failed", "stopped"]
@@ -165,7 +165,8 @@ def _check_same(progress: Progress) -> None:
     pairs = [(name, stored["options"].get(name), value) for name, value in options.items() if name != "algo"]
     pairs.append(("algo", without_folder(str(stored["options"].get("algo"))), without_folder(cell.options.algo)))
     source = cell.start_from.name if cell.start_from else None
-    pairs.append(("start_from", _place(stored["options"].get("trained_agent")), source))
+    agent = stored["options"].get("trained_agent")
+    pairs.append(("start_from", agent and last_parts(agent), source))
     if source is not None:
         replay = bool(stored["options"].get("with_replay_buffer"))
         pairs.append(("start_from.replay_buffer", replay, cell.options.with_replay_buffer))
@@ -200,8 +201,3 @@ def _check_beginning(progress: Progress, source: Progress) -> None:
             f"{progress.cell.name}: began with {source.cell.name} after {result['n_timesteps']} steps, the study has "
             f"{source.total} of them — expected as many, or another -f"
         )
-
-
-def _place(run: str | None) -> str | None:
-    """A run folder, without the folder of all results, which may have moved."""
-    return run and "/".join(Path(run).parts[-2:])

@@ -31,6 +31,7 @@ def output_file(name: str | Path, flag: str, suffixes: Sequence[str] = ()) -> Pa
         raise ConfigError(f"{flag}: '{name}' — expected a file name that ends with {' or '.join(suffixes)}")
     problem = None
     try:
+        path.resolve()
         if path.is_dir() or str(name).endswith(("/", os.sep)):
             problem = "it is a folder"
         elif path.exists() and not path.is_file():  # a device or a pipe, which would be replaced
@@ -39,6 +40,8 @@ def output_file(name: str | Path, flag: str, suffixes: Sequence[str] = ()) -> Pa
             problem = f"there is no folder {path.parent}"
     except OSError as error:  # such as a name that is too long
         problem = error.strerror
+    except RuntimeError:  # from Python 3.13 on an OSError
+        problem = "it is a loop of links"
     if problem:
         raise ConfigError(f"{flag}: '{name}' cannot be written — {problem}")
     _try_to_write(path.parent, name, flag)
@@ -172,15 +175,21 @@ def alone(folder: Path, message: str) -> Iterator[None]:
 
     :param folder: where the lock is
     :param message: what to say if another one is
-    :raises ConfigError: if another one is
+    :raises ConfigError: if another one is, or that cannot be told
     """
     from filelock import FileLock, Timeout
 
+    lock = FileLock(folder / ".lock", timeout=0)
     try:
-        with FileLock(folder / ".lock", timeout=0):
-            yield
+        lock.acquire()
     except Timeout:
         raise ConfigError(message) from None
+    except OSError as error:  # such as a file of another user
+        raise ConfigError(f"'{lock.lock_file}' cannot be locked — {error.strerror}") from None
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 @contextmanager

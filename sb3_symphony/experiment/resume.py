@@ -1,5 +1,6 @@
 """A run that was stopped, killed or finished, and how it goes on."""
 
+import math
 import sys
 import zipfile
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from sb3_symphony.analysis.runs import Evaluations, noted_log, read_evaluations
 from sb3_symphony.common.checkpoint import Checkpoint, checkpoint_files, newest_checkpoint
+from sb3_symphony.common.checks import constructor_parameters
 from sb3_symphony.common.files import DamagedFile, write_atomically
 from sb3_symphony.experiment.config import (
     ConfigError,
@@ -25,8 +27,8 @@ from sb3_symphony.experiment.config import (
     read_yaml,
     validated,
 )
-from sb3_symphony.experiment.registry import without_folder
-from sb3_symphony.experiment.run_folder import RunFolder, saved_count
+from sb3_symphony.experiment.registry import load_algorithm, without_folder
+from sb3_symphony.experiment.run_folder import RunFolder, last_parts, saved_count
 
 #: options that may differ from those the run was started with. Schedules depend on the first of them, rounding on the
 #: device, results on no other
@@ -42,12 +44,14 @@ class StoredRun:
     :param options: options to go on with
     :param config: configuration to go on with
     :param steps: environment steps of its saved model, 0 if there is none
+    :param save_freq: steps between checkpoints until now
     """
 
     run: RunFolder
     options: TrainOptions
     config: RunConfig
     steps: int
+    save_freq: int
 
     @property
     def finished(self) -> bool:
@@ -97,7 +101,7 @@ class StoredRun:
             checkpoint = newest_checkpoint(self.run.checkpoints)
         except DamagedFile as error:
             raise ConfigError(f"--resume: no checkpoint of '{self.run.path}' is whole — {error}") from None
-        if checkpoint is None and self.steps >= self.options.save_freq:  # there was one, and much was learned since
+        if checkpoint is None and self.steps >= self.save_freq + self._rollout:  # there was one, and much was learned since
             raise ConfigError(
                 f"--resume: '{self.run.path}' has a model of {self.steps} steps, but no checkpoint — start a new run"
             )
@@ -105,6 +109,15 @@ class StoredRun:
             n_timesteps = self.config.settings.n_timesteps
             raise ConfigError(f"-n: {n_timesteps} — the run has taken {checkpoint.steps} steps already, expected more")
         return checkpoint
+
+    @property
+    def _rollout(self) -> float:
+        """Environment steps of a rollout, at whose start alone a checkpoint is made; infinite if episodes decide."""
+        algorithm = load_algorithm(self.options.algo)
+        name = "n_steps" if issubclass(algorithm, OnPolicyAlgorithm) else "train_freq"
+        length = self.config.plain.get(name, constructor_parameters(algorithm)[name].default)
+        length, unit = length if isinstance(length, list | tuple) else (length, "step")
+        return length * self.config.settings.n_envs if unit == "step" else math.inf
 
 
 def _spelling(name: str) -> str:
@@ -133,7 +146,10 @@ def open_run(options: TrainOptions) -> StoredRun:
     """
     assert options.resume is not None
     folder = Path(options.resume)
-    found = sorted(folder.glob("*/args.yml"))
+    try:
+        found = sorted(folder.glob("*/args.yml"))
+    except OSError as error:  # such as a name that is too long
+        raise ConfigError(f"--resume: '{folder}' cannot be read — {error.strerror}") from None
     if len(found) != 1:
         what = "no run folder (no <env>/args.yml in it)" if folder.is_dir() else "no such folder"
         raise ConfigError(f"--resume: '{folder}' — {what}; expected one such as logs/symphony/BipedalWalker-v3_1")
@@ -147,8 +163,9 @@ def open_run(options: TrainOptions) -> StoredRun:
         raise ConfigError(f"{found[0]}: {error}") from None
 
     given = {name: getattr(options, name) for name in options.model_fields_set - {"resume"}}
-    if without_folder(given.get("algo", "")) == without_folder(stored.algo):  # the file may have been moved
-        stored = stored.model_copy(update={"algo": given.pop("algo")})
+    for name, place in (("algo", without_folder), ("trained_agent", last_parts)):  # which may have been moved
+        if name in given and place(given[name] or "") == place(getattr(stored, name) or ""):
+            stored = stored.model_copy(update={name: given.pop(name)})
     for name, value in given.items():
         if name not in _CHANGEABLE and value != getattr(stored, name):
             allowed = ", ".join(map(_spelling, sorted(_CHANGEABLE)))
@@ -165,7 +182,7 @@ def open_run(options: TrainOptions) -> StoredRun:
     source["n_timesteps"] = changed.get("n_timesteps", -1)
     config = load_config(stored.model_copy(update=source))
 
-    result = StoredRun(run, resumed, config, model_steps(run.model))
+    result = StoredRun(run, resumed, config, model_steps(run.model), stored.save_freq)
     if not result.finished and not run.checkpoints.is_dir():
         why = "they were deleted" if stored.save_freq > 0 else "it was started without --save-freq"
         raise ConfigError(f"--resume: '{folder}' has no checkpoints — {why}")
@@ -176,7 +193,7 @@ def open_run(options: TrainOptions) -> StoredRun:
 
 def restore_files(run: RunFolder, checkpoint: Checkpoint | None) -> None:
     """
-    Give the files that grow in the course of a run the content they had at a checkpoint; without one, remove them, and keep
+    Give the files that change in the course of a run the content they had at a checkpoint; without one, remove them, and keep
     the model of a run that was stopped so soon as that of its steps.
 
     :param run: folder of the run
@@ -188,7 +205,7 @@ def restore_files(run: RunFolder, checkpoint: Checkpoint | None) -> None:
         run.model.rename(run.model_at(steps))
         if run.normalization.is_file():
             run.normalization.rename(run.normalization_at(steps))
-    for path in run.growing_files():
+    for path in run.changing_files():
         if path.name not in contents:
             path.unlink()
     for name, content in contents.items():

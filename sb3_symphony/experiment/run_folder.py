@@ -34,6 +34,14 @@ def saved_count(model: Path, name: str) -> int:
         return int(json.loads(archive.read("data"))[name])
 
 
+def last_parts(run: str) -> str:
+    """
+    :param run: a run folder, or a model
+    :return: the same without the folder of all results, which may have been moved
+    """
+    return "/".join(Path(run).parts[-2:])
+
+
 @dataclass(frozen=True)
 class RunFolder:
     """
@@ -142,9 +150,10 @@ class RunFolder:
         path = self.details / "command.txt"
         return path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""
 
-    def growing_files(self) -> list[Path]:
-        """:return: files that get longer while training, as far as they are there"""
-        return [*sorted(self.path.glob("*.monitor.csv")), *self.path.glob("evaluations.npz")]
+    def changing_files(self) -> list[Path]:
+        """:return: files that get longer or are replaced while training, as far as they are there"""
+        best = [path for path in (self.best_model, self.best_normalization) if path.is_file()]
+        return [*sorted(self.path.glob("*.monitor.csv")), *self.path.glob("evaluations.npz"), *best]
 
     @property
     def log_folder(self) -> Path:

@@ -62,6 +62,7 @@ class TrainResult:
     :param evaluation: returns of the last evaluation's episodes, empty if there was none
     :param seconds: wall-clock time of learning, that before a resume included
     :param interrupted: whether it was stopped by a signal
+    :param signalled: whether one came, maybe too late to stop it
     :param diverged: whether weights are not finite
     :param untouched: whether there was nothing left to do in a run that was to be resumed
     :param solved: whether that is because its ``stop_reward`` was reached
@@ -72,6 +73,7 @@ class TrainResult:
     evaluation: list[float]
     seconds: float
     interrupted: bool = False
+    signalled: bool = False
     diverged: bool = False
     untouched: bool = False
     solved: bool = False
@@ -358,7 +360,7 @@ def train_seeds(options: TrainOptions, command: str | None = None) -> list[Train
     for seed in range(first, first + options.n_seeds):
         one = options.model_copy(update={"seed": seed, "n_seeds": 1})
         results.append(train(one, command and f"{command} --seed {seed} --n-seeds 1"))
-        if results[-1].interrupted:
+        if results[-1].signalled:
             break
         if not options.quiet and len(results) < options.n_seeds:
             print(results[-1].summary(), flush=True)
@@ -441,7 +443,7 @@ def _train(
             options.save_freq,
             options.keep,
             callbacks=tuple(callbacks),
-            files=run.growing_files,
+            files=run.changing_files,
             checkpoint=checkpoint,
             wanted=stop.here,
         )
@@ -480,4 +482,12 @@ def _train(
             checkpoints.save(rollout_follows=False)
     results = evaluation.evaluations_results if evaluation is not None else []
     last = [float(value) for value in results[-1]] if results else []
-    return TrainResult(run, model.num_timesteps, last, seconds, stop.requested and not finished, not finite_weights(model))
+    return TrainResult(
+        run,
+        model.num_timesteps,
+        last,
+        seconds,
+        interrupted=stop.requested and not finished,
+        signalled=stop.requested,
+        diverged=not finite_weights(model),
+    )
