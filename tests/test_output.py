@@ -105,7 +105,7 @@ def test_without_permission(folder):
     locked.chmod(0o700)
     with ordinary_user():
         for arguments in ({"conf_file": "locked/a.yml"}, {"resume": "locked/run"}):
-            with pytest.raises(ConfigError, match=r"locked/.*' cannot be read — Permission denied"):
+            with pytest.raises(ConfigError, match=r": 'locked/.*'"):
                 train(TrainOptions(algo="td3", env="Pendulum-v1", **arguments))
 
 

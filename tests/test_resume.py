@@ -468,7 +468,7 @@ def test_not_a_run(folder, capsys):
         assert main(["train", "--resume", name]) == 2
         assert message in capsys.readouterr().err
     assert main(["train", "--resume", "x" * 300]) == 2
-    assert f"--resume: '{'x' * 300}' cannot be read — File name too long" in capsys.readouterr().err
+    assert f"--resume: '{'x' * 300}'" in capsys.readouterr().err
     assert list(folder.iterdir()) == [folder / "empty"]
     (folder / "zoo" / "Pendulum-v1").mkdir(parents=True)
     arguments = "!!python/object/apply:collections.OrderedDict [[[algo, td3], [env, Pendulum-v1], [max_total_trials, null]]]"

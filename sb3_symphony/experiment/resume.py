@@ -148,10 +148,10 @@ def open_run(options: TrainOptions) -> StoredRun:
     folder = Path(options.resume)
     try:
         found = sorted(folder.glob("*/args.yml"))
+        what = "no run folder (no <env>/args.yml in it)" if folder.is_dir() else "no such folder"
     except OSError as error:  # such as a name that is too long
         raise ConfigError(f"--resume: '{folder}' cannot be read — {error.strerror}") from None
     if len(found) != 1:
-        what = "no run folder (no <env>/args.yml in it)" if folder.is_dir() else "no such folder"
         raise ConfigError(f"--resume: '{folder}' — {what}; expected one such as logs/symphony/BipedalWalker-v3_1")
     run = RunFolder(folder, found[0].parent.name)
     content = read_yaml(found[0])
