@@ -123,11 +123,16 @@ def training_state(model: BaseAlgorithm) -> dict[str, Any]:
     }
 
 
+def _noise_attributes(attributes: dict[str, Any]) -> set[str]:
+    """Names of the attributes of a noise, of those for several environments, which ``learn()`` makes of one, of that one."""
+    return set(vars(attributes["_base_noise"]) if "_base_noise" in attributes else attributes)
+
+
 def _check_surroundings(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     """Look whether noise and wrappers are those of a state."""
     assert model.env is not None
     noise = getattr(model, "action_noise", None)
-    if (state["noise"] or {}).keys() != ({} if noise is None else vars(noise)).keys():
+    if _noise_attributes(state["noise"] or {}) != _noise_attributes({} if noise is None else vars(noise)):
         raise ValueError(f"action_noise: the checkpoint is of another one than {noise}")
     there, own = len(state["vec env"]), len(vec_env_state(model.env))
     if there != own:
