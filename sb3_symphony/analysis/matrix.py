@@ -12,10 +12,10 @@ from sb3_symphony.analysis.style import house_style, line_style, name_lines, new
 from sb3_symphony.analysis.tables import Result, Row, aligned, by_algorithm
 
 
-def _conditions(result: Result) -> dict[str, np.ndarray]:
-    """Returns under each condition that it was evaluated under, shape ``(n,)``."""
+def _conditions(result: Result) -> dict[str, list[float]]:
+    """Returns under each condition that it was evaluated under."""
     evaluated = (result.summary or {}).get("conditions", {})
-    return {name: np.array(each["returns"], dtype=np.float64) for name, each in evaluated.items()}
+    return {name: each["returns"] for name, each in evaluated.items()}
 
 
 def matrix_rows(results: Sequence[Result]) -> list[Row]:
@@ -39,7 +39,7 @@ def matrix_rows(results: Sequence[Result]) -> list[Row]:
 def _entries(results: Sequence[Result], name: str) -> np.ndarray | None:
     """Returns under a condition of all seeds, shape ``(seeds · episodes,)``."""
     returns = [own[name] for each in results if name in (own := _conditions(each))]
-    return np.concatenate(returns) if returns else None
+    return np.concatenate(returns, dtype=np.float64) if returns else None
 
 
 def matrix_table(results: Sequence[Result], names: Sequence[str], label: str) -> str:

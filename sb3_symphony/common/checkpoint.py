@@ -153,7 +153,6 @@ def restore_training_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     :raises ValueError: if it is of another model, as far as that is seen; what is not may raise any error
     """
     assert model.env is not None
-    _check_surroundings(model, state)
     vars(model).update(state["attributes"])
     model.set_parameters(state["parameters"], exact_match=True, device=model.device)
     for name, value in state["tensors"].items():
@@ -395,6 +394,8 @@ class ExactCheckpoints(BaseCallback):
     def _restore(self, checkpoint: Checkpoint) -> None:
         model, state = self.model, checkpoint.state
         assert model.env is not None
+        with _fitting(checkpoint):
+            _check_surroundings(model, state)
         episodes = state["episodes"] if is_recorded(model.env) else []
         exact = len(episodes) == model.n_envs and all(each_copy(model.env, "replay", episodes))
         with _fitting(checkpoint):

@@ -65,8 +65,10 @@ class RecordedEpisode(gym.Wrapper):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        if unwrap_wrapper(env, Monitor) is None:
+        monitor = unwrap_wrapper(env, Monitor)
+        if not isinstance(monitor, Monitor):
             raise TypeError(f"RecordedEpisode: {env} — expected a Monitor inside (make_vec_env: wrapper_class=…)")
+        self.monitor = monitor
         self.start: dict[str, Any] = {}
         self.actions: list[Any] = []
         self.rewards: list[Any] = []
@@ -142,13 +144,6 @@ class RecordedEpisode(gym.Wrapper):
         self._set_generators(state["generators"])
         self._set_monitor(state)
         self.monitor.needs_reset = True  # as in replay()
-
-    @property
-    def monitor(self) -> Monitor:
-        """The ``Monitor`` inside."""
-        monitor = unwrap_wrapper(self.env, Monitor)
-        assert isinstance(monitor, Monitor)
-        return monitor
 
     def _set_monitor(self, state: dict[str, Any]) -> None:
         for name, value in state["monitor"].items():

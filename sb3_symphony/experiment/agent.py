@@ -142,7 +142,7 @@ def check_device(name: str) -> None:
     try:
         th.zeros(1, device="cpu" if name == "auto" else name).item()
     # What torch raises for an unknown name or a device without numbers ("meta"); without CUDA; without that backend ("xla")
-    except (RuntimeError, AssertionError, NotImplementedError):
+    except (RuntimeError, AssertionError):
         known = "auto, cpu" + ", cuda" * th.cuda.is_available()
         raise ConfigError(f"--device: '{name}' is not there — expected {known}") from None
 

@@ -115,7 +115,8 @@ class StoredRun:
         """Environment steps of a rollout, at whose start alone a checkpoint is made; infinite if episodes decide."""
         algorithm = load_algorithm(self.options.algo)
         name = "n_steps" if issubclass(algorithm, OnPolicyAlgorithm) else "train_freq"
-        length = self.config.plain.get(name, constructor_parameters(algorithm)[name].default)
+        parameters = constructor_parameters(algorithm)  # one's own class may have settled it
+        length = self.config.plain.get(name, parameters[name].default if name in parameters else math.inf)
         length, unit = length if isinstance(length, list | tuple) else (length, "step")
         return length * self.config.settings.n_envs if unit == "step" else math.inf
 
